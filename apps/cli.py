@@ -25,7 +25,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from functools import partial
 from importlib import import_module
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
@@ -197,7 +197,7 @@ class VerbGroup(TyperGroup):
             _set_help(verb)
         group = typer.main.get_group(app)
         group.name = name
-        command = group if is_group else cast("TyperCommand", group.commands[name])
+        command: Any = group if is_group else group.commands[name]
         simplify_help(command)
         return command
 

@@ -136,8 +136,7 @@ def with_past(result: Result, settings: Mapping[str, Any], *inputs: Path) -> Res
     """Return a result that knows how it came about, and what it knew of its own past."""
     made: Any = result
     past = build_provenance(settings, *inputs, earlier=made.provenance)
-    changed: Result = dataclasses.replace(made, provenance=past)
-    return changed
+    return dataclasses.replace(made, provenance=past)
 
 
 def say(what: str, text: object) -> None:

@@ -387,8 +387,7 @@ def _run_process(
     if done.returncode:
         complaints = done.stderr.strip().splitlines() or [f"ended with status {done.returncode}"]
         return {"problem": complaints[-1]}
-    figures: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return figures
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 PAGE_HEADER = """\

@@ -138,7 +138,7 @@ def prepare_lensless(side: int) -> PreparedCase:
 
 def compute_scaled_nmse(picture: Float32Array, scene: Float32Array) -> float:
     """Normalised squared error of a picture at its best scale: programs differ in theirs."""
-    scale = float(np.vdot(picture, scene)) / float(np.vdot(picture, picture))
+    scale = np.vdot(picture, scene) / np.vdot(picture, picture)
     return nmse(scale * picture, scene)
 
 
@@ -246,10 +246,10 @@ def prepare_quality(name: str, ratio_percent: int) -> PreparedCase:
     def judge() -> dict[str, float]:
         errors, searches = zip(*map(recover, range(SEEDS)), strict=True)
         return {
-            "nmse_percent": float(np.mean(errors)),
-            "spread_percent": float(np.std(errors, ddof=1)),
+            "nmse_percent": np.mean(errors),
+            "spread_percent": np.std(errors, ddof=1),
             "limit_percent": limits[ratio_percent],
-            "weight_search_s": float(np.median(searches)),
+            "weight_search_s": np.median(searches),
         }
 
     measured = measure_seed(0)

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 
@@ -121,9 +120,8 @@ def prepare_projection(side: int) -> PreparedCase:
 
 def time_radon(picture: Float32Array) -> float:
     """Seconds of scikit-image's projections of the picture at the seven angles."""
-    from skimage import transform
+    from skimage.transform import radon
 
-    radon: Any = transform.radon  # it has no types
     radon(picture, np.rad2deg(ANGLES_RAD), circle=False)
     began = time.perf_counter()
     radon(picture, np.rad2deg(ANGLES_RAD), circle=False)

@@ -129,7 +129,7 @@ MIN_SPAN_SIGMA = 6  # of the colours of offsets, or noise would look like a patt
 def make_range_calibration_figure(found: RangeFit, distances: Sequence[float]) -> Figure:
     """Draw the fitted walk over what was measured, and the pictures of the pixels' own numbers."""
     known = found.calibration
-    noise = float(np.nanmedian(known.offset_sigma)) / MILLIMETRE if known.offset_sigma.size else 0.0
+    noise = np.nanmedian(known.offset_sigma) / MILLIMETRE if known.offset_sigma.size else 0.0
     pictures: list[tuple[AnyArray, str, str, dict[str, Any]]] = [
         (known.offsets / MILLIMETRE, "offset", "mm", {"least_span": MIN_SPAN_SIGMA * noise}),
         (known.offset_sigma / MILLIMETRE, "its standard deviation", "mm", {"vmin": 0}),
@@ -175,7 +175,7 @@ PREDICTED_COLOUR, SIMULATED_COLOUR = "#2e6f95", "#e8b04a"
 def make_design_figure(reports: Mapping[str, DesignReport]) -> Figure:
     """Draw instruments below each other, by their names."""
     figure = make_figure(DESIGN_INCHES[0], DESIGN_INCHES[1] * len(reports))
-    parts: Any = figure.subfigures(len(reports), 1, squeeze=False)
+    parts = figure.subfigures(len(reports), 1, squeeze=False)
     lettered: list[Axes] = []
     for part, (name, report) in zip(parts[:, 0], reports.items(), strict=True):
         part.suptitle(f"{name}: {_describe(report)}", fontsize=SMALL_FONT_PT + 2)

@@ -52,10 +52,10 @@ def make_comparison_figure(
     on; `truth`: outlined where it is known.
     """
     grid = next(iter(volumes.values())).grid
-    across = float(np.subtract(*outer_edges(grid.x)[::-1]))
-    heights = [float(np.subtract(*outer_edges(axis)[::-1])) / across for axis in (grid.y, grid.z)]
+    across = np.subtract(*outer_edges(grid.x)[::-1])
+    heights = [np.subtract(*outer_edges(axis)[::-1]) / across for axis in (grid.y, grid.z)]
     rows = np.clip(heights, MIN_PANEL_ASPECT, MAX_PANEL_ASPECT) * COLUMN_INCHES
-    figure = make_figure(COLUMN_INCHES * len(volumes) + 1, float(rows.sum()) + TEXT_INCHES)
+    figure = make_figure(COLUMN_INCHES * len(volumes) + 1, rows.sum() + TEXT_INCHES)
     panels = figure.subplots(
         2, len(volumes), squeeze=False, height_ratios=rows.tolist(), sharex=True
     )
@@ -82,7 +82,7 @@ def draw_view(axes: Axes, volume: Volume, plane: str, truth: HiddenTruth | None)
     picture = volume.magnitude.max(axis=along)
     right, down = (getattr(volume.grid, name) for name in plane)
     (left, last), (upper, lower) = outer_edges(right), outer_edges(down)
-    brightest = float(picture.max()) or 1.0
+    brightest = picture.max() or 1.0
     drawn = draw_image(axes, picture / brightest, (left, last, lower, upper), vmin=0, vmax=1)
     if truth is not None:
         draw_outline(axes, truth, plane)
@@ -158,13 +158,13 @@ def _draw_room(axes: Axes, run: DemoRun) -> None:
     """Top view with the wall at the upper edge: who sees what, and the way of light."""
     middle = run.capture.wall[run.capture.wall.shape[0] // 2]
     x, z = middle[:, 0], middle[:, 2]
-    behind = float(z.min()) - 0.14
+    behind = z.min() - 0.14
     axes.fill_between(x, z, behind, color=WALL_COLOUR)
     axes.plot(x, z, color=INK_COLOUR, lw=2)
     draw_outline(axes, run.truth, "xz")
-    seen = int(np.argmin(np.abs(x - WALL_POINT_X_M)))
+    seen = np.argmin(np.abs(x - WALL_POINT_X_M))
     laser_x, _, laser_z = run.capture.laser.tolist()
-    spot, point = (laser_x, laser_z), (float(x[seen]), float(z[seen]))
+    spot, point = (laser_x, laser_z), (x[seen], z[seen])
     for start, end, colour, style in (
         (DEVICE_POSITION_M, spot, DEVICE_COLOUR, "--"),
         (spot, HIDDEN_POINT_M, OUTGOING_COLOUR, "-"),

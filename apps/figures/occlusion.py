@@ -88,7 +88,7 @@ def _draw_lines(axes: Axes, region: InactiveRegion, reach: float) -> None:
         arrow = {"arrowstyle": "<->", "color": OCCLUDER_COLOUR}
         axes.annotate("", (stop, 0), (start, 0), arrowprops=arrow)
         said = f"l = {region.length / MILLIMETRE:.1f} mm, hidden"
-        note: dict[str, Any] = {"textcoords": "offset points", "bbox": TEXT_BOX}
+        note: Any = {"textcoords": "offset points", "bbox": TEXT_BOX}
         axes.annotate(said, (start, 0), (8, 7), color=OCCLUDER_COLOUR, **note)
 
 
@@ -139,7 +139,7 @@ def _select_pictures(experiment: Experiment) -> list[tuple[str, AnyArray, AnyArr
     everything = experiment.pictures[len(experiment.pictures) // 2].sum(axis=-1)
     refocused = experiment.conventional
     # what a light-field camera shows of the target is drawn as bright as the haze allows
-    scaled = refocused * (truth.max() / max(float(refocused.max()), 1e-12))
+    scaled = refocused * (truth.max() / max(refocused.max(), 1e-12))
     return [
         ("one view,\nall its light", everything, None),
         ("a light-field camera,\nall pixels, refocused behind", scaled, truth),
@@ -158,11 +158,11 @@ def _draw_plan(axes: Axes, experiment: Experiment, probes: Sequence[ProbeResult]
     """The scene from above: which views see which place, the target, and small targets on the axis."""
     scene = experiment.scene
     draw_region(axes, scene.region, DRAWN_DEPTH_FACTOR * scene.behind)
-    halves = [abs(body.centre[0]) + float(body.shape.half_extent[0]) for body in scene.target]
+    halves = [abs(body.centre[0]) + body.shape.half_extent[0] for body in scene.target]
     z, half = scene.distance / MILLIMETRE, max(halves) / MILLIMETRE
     low, high = axes.get_ylim()
     axes.plot([z, z], [-half, half], color=OCCLUDER_COLOUR, lw=4, alpha=0.9)
-    note: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "bbox": TEXT_BOX}
+    note: Any = {"textcoords": "offset points", "ha": "right", "bbox": TEXT_BOX}
     axes.annotate("target", (z, high), (-6, -6), va="top", color=OCCLUDER_COLOUR, **note)
     for number, one in enumerate(probes):
         colour, mark = (SEEN_COLOUR, "o") if one.is_recovered else (UNSEEN_COLOUR, "X")
@@ -185,12 +185,12 @@ def draw_history(axes: Axes, experiment: Experiment) -> None:
     history = np.maximum(measurements.history / measurements.history.max(), MIN_RELATIVE_LIGHT)
     axes.set_facecolor(EMPTY_COLOUR)
     axes.semilogy(times, history, color="white", lw=1.5, drawstyle="steps-mid")
-    look: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": SMALL_FONT_PT}
+    look: Any = {"ha": "center", "va": "top", "fontsize": SMALL_FONT_PT}
     named = (("occluder", OCCLUDER_COLOUR), ("target", LINE_COLOUR))
     for found, (name, colour) in zip(measurements.find_returns(), named, strict=False):
         gate = times[found.bins]
-        axes.axvspan(float(gate[0]), float(gate[-1]), color=colour, alpha=0.3)
-        peak = float(gate[np.argmax(history[found.bins])])
+        axes.axvspan(gate[0], gate[-1], color=colour, alpha=0.3)
+        peak = gate[np.argmax(history[found.bins])]
         said = f"{name}\n{found.distance / MILLIMETRE:.1f} mm"
         axes.text(peak, CAPTION_LEVEL, said, color="white", **look)
     axes.set_ylim(MIN_RELATIVE_LIGHT, 2 * CAPTION_LEVEL)
@@ -242,8 +242,8 @@ class _Film:
             shown.set_data(picture)
         self.figure.suptitle(title, fontsize=SMALL_FONT_PT + 4)
         self._canvas.draw()
-        drawn: Any = self._canvas.buffer_rgba()
-        self._drawn.append(Image.fromarray(np.asarray(drawn)[..., :3]))
+        drawn = np.asarray(self._canvas.buffer_rgba())[..., :3]
+        self._drawn.append(Image.fromarray(drawn))
 
     def save(self, path: Path, shown_ms: int, last_ms: int | None = None) -> None:
         """Write it; without a time for the last picture it runs there and back again."""
@@ -272,7 +272,7 @@ def save_walk_film(experiment: Experiment, path: Path, advance: Callable[[int], 
     """Write a GIF: the target walks past behind the occluder, in `WALK_STEPS` steps."""
     names = ("one view, all its light", "one view, the second return", "ToF-CLIP", "truth")
     film = _Film((9.4, 2.9), names, experiment, columns=4, bottom=0.02)
-    brightest = float(experiment.truth.max())
+    brightest = experiment.truth.max()
     for number, across in enumerate(np.linspace(-WALK_REACH_M, WALK_REACH_M, WALK_STEPS)):
         settings = replace(experiment.settings, seed=experiment.settings.seed + number)
         there = type(experiment)(experiment.scene.move_target(float(across)), settings)
@@ -299,7 +299,7 @@ def _make_flash_frames(experiment: Experiment) -> list[FlashFrame]:
         for instant in found.bins.start + np.flatnonzero(lit[found.bins] > DARK_THRESHOLD):
             pictures = middle[..., instant] / seen, lit[instant] * recovered / made
             title = f"{times[instant]:.0f} ps after the flash"
-            frames.append(FlashFrame(float(times[instant]), title, pictures))
+            frames.append(FlashFrame(times[instant], title, pictures))
     brightest = experiment.truth.max()
     behind, last = separated.plain, "nothing comes from behind the occluder"
     if separated.sees_target:

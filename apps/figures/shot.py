@@ -241,7 +241,7 @@ def _draw_errors(axes: Axes, returns: Returns, truth: GroundTruth) -> None:
     error = (returns.image("range") - truth.range)[truth.target] / MILLIMETRE
     error = error[np.isfinite(error)]
     bin_mm = SPEED_OF_LIGHT * truth.bin_width / 2 / MILLIMETRE
-    reach = min(2 * bin_mm, 3 * float(np.percentile(np.abs(error), 90)))
+    reach = min(2 * bin_mm, 3 * np.percentile(np.abs(error), 90))
     edges = np.linspace(-reach, reach, HISTOGRAM_BINS).tolist()
     axes.hist(np.clip(error, edges[0], edges[-1]), edges, color="#4c72b0")
     title = f"range error, median {np.median(np.abs(error)):.2f} mm"
@@ -255,7 +255,7 @@ def make_range_figure(found: SurfaceImage) -> Figure:
     axes = figure.subplots(2, 2)
     seen = np.isfinite(found.range)
     sigma, photons = (
-        float(np.median(one[seen])) if seen.any() else np.nan
+        np.median(one[seen]) if seen.any() else np.nan
         for one in (found.range_sigma, found.intensity)
     )
     figure.suptitle(
@@ -305,7 +305,7 @@ def make_scene_figure(
     shown = sorted(numbered[:MAX_RANGE_PANELS], key=lambda pair: pair[1].range)
     panels = [front, space, above]
     for column, (number, one) in enumerate(shown, 1):
-        row = int(np.abs(distance - one.range).argmin())
+        row = np.abs(distance - one.range).argmin()
         gate = slice(max(0, row - HALF_GATE_BINS), row + HALF_GATE_BINS + 1)
         focus = f", shear {frames.shears[row]:.2f} px" if frames.shears.any() else ""
         picture = brightness[gate].sum(axis=0)

@@ -136,7 +136,7 @@ def add_colour_bar(axes: Axes, mapped: Any, meaning: str) -> None:
 def outer_edges(axis: FloatArray) -> tuple[float, float]:
     """Outer edges of the first and last pixel of an even axis; a single one is a unit wide."""
     half = (axis[-1] - axis[0]) / (2 * (axis.size - 1)) if axis.size > 1 else 0.5
-    return float(axis[0] - half), float(axis[-1] + half)
+    return axis[0] - half, axis[-1] + half
 
 
 def draw_camera_picture(
@@ -191,8 +191,8 @@ def scale_brightness(picture: AnyArray, gamma: float = 1.0) -> dict[str, Any]:
     """
     from matplotlib.colors import PowerNorm
 
-    top = float(np.percentile(picture, WHITE_PERCENTILE)) if picture.size else 0.0
-    return {"norm": PowerNorm(gamma, 0, top if top > 0 else float(picture.max(initial=0)) or 1.0)}
+    top = np.percentile(picture, WHITE_PERCENTILE) if picture.size else 0.0
+    return {"norm": PowerNorm(gamma, 0, top if top > 0 else picture.max(initial=0) or 1.0)}
 
 
 def scatter_points(
@@ -207,8 +207,7 @@ def scatter_points(
 def tone_map(picture: AnyArray, gamma: float = 1.0) -> AnyArray:
     """Scale brightness to 0..1 for the eye; a glint does not darken the rest."""
     top = (np.percentile(picture, WHITE_PERCENTILE) or picture.max() or 1.0) if picture.size else 1
-    toned: AnyArray = np.clip(picture / top, 0, 1) ** gamma
-    return toned
+    return np.clip(picture / top, 0, 1) ** gamma
 
 
 CODEC = "vp09"  # free of licences, and every browser plays it

@@ -162,8 +162,7 @@ class Experiment:
         return self._see_target(self.rig.array)
 
     def _see_target(self, array: CameraArray) -> AnyArray:
-        picture: AnyArray = self._render_middle_view(self.scene.target, array).sum(axis=-1)
-        return picture
+        return self._render_middle_view(self.scene.target, array).sum(axis=-1)
 
     def _render_middle_view(self, bodies: Bodies, array: CameraArray) -> Any:
         scene = PulsedScene(bodies, self.rig.lamps)

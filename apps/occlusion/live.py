@@ -119,8 +119,8 @@ def look_behind(experiment: Experiment, opens: float) -> WalkFrame:
     measurements = experiment.measurements
     front, behind, distances = separate_at(measurements, opens)
     middle = experiment.pictures[len(experiment.pictures) // 2]
-    opens_at = float(measurements.rig.compute_flight_time(np.array([opens]))[0])
-    cut = int(np.searchsorted(measurements.time_axis.times, opens_at))
+    opens_at = measurements.rig.compute_flight_time(np.array([opens]))[0]
+    cut = np.searchsorted(measurements.time_axis.times, opens_at)
     pictures = {
         ONE_CAMERA: middle.sum(axis=-1),
         ONE_CAMERA_GATED: middle[..., cut:].sum(axis=-1),
@@ -148,9 +148,7 @@ def separate_at(
 def pair_pictures(left: Picture, right: Picture) -> Picture:
     """Put two pictures of one shape beside each other, enlarged, each at its own brightness."""
     times = max(1, SHOWN_SIDE_PX // max(left.shape))
-    parts = [
-        np.maximum(one, 0) / max(float(np.quantile(one, 0.997)), 1e-12) for one in (left, right)
-    ]
+    parts = [np.maximum(one, 0) / max(np.quantile(one, 0.997), 1e-12) for one in (left, right)]
     first, second = (np.minimum(one, 1).repeat(times, 0).repeat(times, 1) for one in parts)
     gap = np.ones((len(first), GAP_PX))
     return np.hstack([first, gap, second]).astype(np.float32)

@@ -5,6 +5,7 @@ few pixels of the sensor (Supp. Fig. 4); what one iteration costs (Table 1).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -97,7 +98,7 @@ def _tabulate_model(
     import scipy.sparse
 
     shape = (sensors[0].shape_in[0], sensors[0].shape_in[1])
-    pixels = int(np.prod(shape))
+    pixels = shape[0] * shape[1]
     # The columns of a matrix are the responses to the unit vectors: a point in each pixel.
     points = np.eye(pixels, dtype=np.float32).reshape(*shape, pixels)
     parts = []
@@ -128,10 +129,10 @@ def measure_lines(
 
 def compute_psnr_db(estimate: AnyArray, truth: AnyArray) -> float:
     """Peak signal-to-noise ratio in dB, relative to the brightest pixel of the truth."""
-    error = float(np.mean((estimate.astype(np.float64) - truth) ** 2))
+    error = np.mean((estimate.astype(np.float64) - truth) ** 2)
     if error == 0:
         raise InputError("the estimate is the truth itself: its PSNR is infinite")
-    return float(10 * np.log10(float(truth.max()) ** 2 / error))
+    return 10 * np.log10(float(truth.max()) ** 2 / error)
 
 
 WIDTHS_PX = (1, 2, 4, 8, 16, 32, 64)
@@ -339,7 +340,7 @@ def measure_iteration_costs(
             step = 1 / (1.02 * estimate_squared_norm(model, NORM_ITERATIONS))
             prior = NonnegativeTotalVariation(weight)
             solver = Fista(model, LeastSquares(measurements), prior, step, 1)
-            numbers = (measurements.size, int(np.prod(model.shape_in)))
+            numbers = (measurements.size, math.prod(model.shape_in))
             seconds = _measure_median_seconds(solver.step, repeats)
             costs.append(IterationCost(name, recovers, *numbers, complexity, seconds))
     return costs
@@ -353,7 +354,7 @@ def _measure_median_seconds(action: Callable[[], object], repeats: int) -> float
         # The first run fills caches and compiles; it does not count.
         if number:
             seconds.append(perf_counter() - started)
-    return float(np.median(seconds))
+    return np.median(seconds)
 
 
 SCENE, SHEAR = "letters", -0.4

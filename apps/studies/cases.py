@@ -179,8 +179,7 @@ class Library:
 
 def find_reference_view(light_field: LightField) -> AnyArray:
     """Return the picture of the view nearest to the middle of the aperture."""
-    picture: AnyArray = light_field.pictures[np.argmin((light_field.views**2).sum(axis=1))]
-    return picture
+    return light_field.pictures[np.argmin((light_field.views**2).sum(axis=1))]
 
 
 @dataclass(frozen=True)

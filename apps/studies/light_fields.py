@@ -189,7 +189,7 @@ def compute_depth_accuracy(
     errors = [np.abs(found - np.roll(true, (y, x), (0, 1))) for y in near for x in near]
     right = np.min(errors, axis=0) <= 0.75 * step
     inner = (slice(FOCUS_BORDER_PX, -FOCUS_BORDER_PX),) * 2
-    return float(right[inner][textured[inner]].mean())
+    return right[inner][textured[inner]].mean()
 
 
 @study(
@@ -266,7 +266,7 @@ def run_glossy_plate(library: Library, seeds: int, advance: Advance) -> Outcome:
         plate = binary_erosion(rendered.shears < 0, iterations=4)
         reference = find_reference_view(field)
         stacks = [_recover_stack(field, seed, advance) for seed in range(seeds)]
-        in_focus = int(np.argmin(abs(STACK_SHEARS - PLATE_SHEAR)))
+        in_focus = np.argmin(abs(STACK_SHEARS - PLATE_SHEAR))
         shears = [STACK_SHEARS[estimate_depth_from_focus(stack)] for stack in stacks]
         errors = tuple(100 * nmse(one.pictures[in_focus], reference, BORDER_PX) for one in stacks)
         right = tuple(
@@ -321,4 +321,4 @@ def _measure_unevenness(field: LightField, where: BoolArray) -> float:
         ]
     )
     deviation, mean = moved.std(axis=0)[where], moved.mean(axis=0)[where]
-    return float(np.sqrt(np.mean(deviation**2)) / mean.mean())
+    return np.sqrt(np.mean(deviation**2)) / mean.mean()

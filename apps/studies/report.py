@@ -237,7 +237,7 @@ def make_reproduction_figure(title: str, outcome: Outcome) -> Figure:
                     place, panel.picture, cmap=DEPTH_COLOURMAP, vmin=MIN_SHEAR, vmax=MAX_SHEAR
                 )
             else:
-                brightest = float(np.percentile(panel.picture, WHITE_PERCENTILE)) or 1.0
+                brightest = np.percentile(panel.picture, WHITE_PERCENTILE) or 1.0
                 draw_image(place, panel.picture, cmap="gray", vmin=0, vmax=brightest)
             place.set_title(panel.title, fontsize=SMALL_FONT_PT - 2)
     return figure

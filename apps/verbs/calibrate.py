@@ -239,7 +239,7 @@ class _ShotReader:
             )
         bare = frames.camera.replace(range_calibration=None)
         returns = depth(frames, bare if frames.returns is None else None)
-        record = float(frames.times[0]), float(frames.times[-1])
+        record = frames.times[0], frames.times[-1]
         return TargetShot(replace(returns, camera=bare), distance, record, shot)
 
     def _load_frames(self, shot: str, distance: float) -> Frames | None:
@@ -293,8 +293,8 @@ def _list_figures(found: RangeFit, shots: int) -> dict[str, Any]:
     import numpy as np
 
     known = found.calibration
-    has_walk = bool(known.walk.size)
-    has_offsets = bool(known.offsets.size)
+    has_walk = known.walk.size
+    has_offsets = known.offsets.size
     figures: dict[str, Any] = {
         "shots": shots,
         "target_share": found.target_fraction,

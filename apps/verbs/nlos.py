@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -370,7 +370,8 @@ def _image(prepared: PreparedImaging[ReconstructSettings]) -> tuple[ReconstructS
     iterations = found.iterations or ITERATIONS[found.refine]
     weight = found.prior_weight
     weight = PRIOR_WEIGHTS[found.refine] if weight is None else weight
-    found, iterated = replace(found, iterations=iterations, prior_weight=weight), cast(Any, method)
+    found = replace(found, iterations=iterations, prior_weight=weight)
+    iterated: Any = method
     refined: Method
     if found.refine == PHOTONS:
         capture = settings.prepare_counts(prepared.recorded)
@@ -499,7 +500,7 @@ def info(
         found = find_settings(recorded, load_settings(ImagingSettings, settings, flags))
     capture, grid = found.prepare(recorded), found.grid()
     shown = settings_to_dict(found)
-    middle = [float(axis[[0, -1]].mean()) for axis in (grid.x, grid.y, grid.z)]
+    middle = [axis[[0, -1]].mean() for axis in (grid.x, grid.y, grid.z)]
     pulse = VirtualPulse(found.wavelength or 0.0, found.cycles)
     paths = capture.axis.paths
     figures = {
@@ -509,8 +510,8 @@ def info(
             "bins": capture.axis.bins,
             "bin_width_ps": capture.bin_width / PICOSECOND,
             "path_per_bin_m": capture.axis.spacing,
-            "first_path_m": float(paths[0]),
-            "last_path_m": float(paths[-1]),
+            "first_path_m": paths[0],
+            "last_path_m": paths[-1],
         },
         "wavelength_mm": {
             **_find_usable_wavelengths(capture, grid, found.cycles),
@@ -549,7 +550,7 @@ def _describe_wall(capture: Capture) -> dict[str, Any]:
     width, height, relief = capture.points.max(axis=0) - capture.points.min(axis=0)
     return {
         "points": len(capture.points),
-        "masked": int(capture.valid.size - len(capture.points)),
+        "masked": capture.valid.size - len(capture.points),
         "shape": shape,
         "width_m": width,
         "height_m": height,
@@ -577,7 +578,7 @@ def _find_usable_wavelengths(capture: Capture, grid: Grid, cycles: float) -> dic
 
     low, high = capture.points.min(axis=0), capture.points.max(axis=0)
     width = float(max(high[0] - low[0], high[1] - low[1]))
-    distance = float(grid.z[[0, -1]].mean() - capture.points[:, 2].mean())
+    distance = grid.z[[0, -1]].mean() - capture.points[:, 2].mean()
     return {
         "shortest": find_shortest_wavelength(capture, cycles) / MILLIMETRE,
         "longest": MAX_BLUR_FRACTION * width**2 / (BLUR_FACTOR * distance) / MILLIMETRE,

@@ -396,10 +396,10 @@ def simulate(
     figures = {
         "wall_points": len(capture.points),
         "bins": capture.axis.bins,
-        "path_m": [float(capture.axis.paths[0]), float(capture.axis.paths[-1])],
+        "path_m": [capture.axis.paths[0], capture.axis.paths[-1]],
         "hidden_facets": len(truth.positions),
-        "largest": float(capture.signal.max()),
-        "total": float(capture.signal.sum(dtype="float64")),
+        "largest": capture.signal.max(),
+        "total": capture.signal.sum(dtype="float64"),
         "seconds": time.perf_counter() - started,
     }
     report(figures, as_json, [out, beside])

@@ -146,7 +146,7 @@ def stream(
     save_settings(show_settings(prepared.settings, [method or ""]), out / SETTINGS_NAME, heading)
     imaging: Callable[[Capture], Volume] = plan.image
     if wanted.average > 1 and isinstance(plan, PhasorPlan):
-        waves, far = plan.field, float(prepared.capture.points[:, 2].max())
+        waves, far = plan.field, prepared.capture.points[:, 2].max()
         average = DepthAverage(plan.grid, far, wanted.average)
         imaging = lambda capture: average.add(waves(capture))  # noqa: E731
     made = VolumeStream(chain([first], coming), prepared, imaging, out, follow_s > 0)

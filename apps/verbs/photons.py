@@ -184,9 +184,9 @@ def photons(
     seen = np.isfinite(found.range)
     figures = {
         "pixels": seen.size,
-        "coverage": float(seen.mean()),
-        "returns": sum(int(np.isfinite(one.range).sum()) for one in (found, *found.further)),
-        "outlier_share": float(found.outlier_probability[seen].mean()) if seen.any() else 0.0,
+        "coverage": seen.mean(),
+        "returns": sum(np.isfinite(one.range).sum() for one in (found, *found.further)),
+        "outlier_share": found.outlier_probability[seen].mean() if seen.any() else 0.0,
         "seconds": time.perf_counter() - started,
         "settings": settings,
     }
@@ -235,7 +235,7 @@ def read_any_photons(
     if axes is not None:
         raise InputError(f"{file}: an instrument knows its own axes")
     counted = read_instrument(address, bin_width)
-    return counted.to_image(), counted.pulse, float(counted.times[0])
+    return counted.to_image(), counted.pulse, counted.times[0]
 
 
 def _load_bins(path: Path, what: str) -> np.ndarray[Any, Any]:

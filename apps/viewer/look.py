@@ -106,7 +106,7 @@ class Scale:
     @property
     def limits(self) -> Limits:
         """Values of the first and the last colour."""
-        return float(self.values[0]), float(self.values[-1])
+        return self.values[0], self.values[-1]
 
     @property
     def factor(self) -> float:
@@ -130,8 +130,7 @@ class Scale:
             number = np.rint(even * np.float32(steps / (high - low))).astype(np.intp)
         else:
             number = np.clip(np.searchsorted(self.values, values, side="right") - 1, 0, steps)
-        colours: NDArray[np.uint8] = load_palette(self.palette)[number]
-        return colours
+        return load_palette(self.palette)[number]
 
 
 def make_scale(view: View, colouring: Colouring) -> Scale:
@@ -223,8 +222,7 @@ class Pick:
     @property
     def position(self) -> Float32Array:
         """x, y, z in m."""
-        position: Float32Array = self.point.xyz[0]
-        return position
+        return self.point.xyz[0]
 
     @property
     def description(self) -> str:
@@ -257,7 +255,7 @@ def find_point_on_ray(xyz: Float32Array, origin: ArrayLike, direction: ArrayLike
     miss[~(depth > 0)] = np.inf  # behind the eye
     close = np.flatnonzero(miss < CLOSE_MISS_RAD)
     if close.size:
-        return int(close[np.argmin(depth[close])])
+        return close[np.argmin(depth[close])]
     return int(np.argmin(miss)) if miss.size and miss.min() <= MAX_MISS_RAD else None
 
 
@@ -285,7 +283,7 @@ def render_pictures(pictures: Mapping[str, Picture], scale: Scale) -> dict[str, 
 def _colour_brightness(picture: Picture, scale: Scale) -> Image:
     """Colour a picture by its brightness, negative values as dark."""
     light = np.maximum(np.nan_to_num(picture), 0)
-    top = float(np.percentile(light, PICTURE_WHITE_PERCENTILE)) or float(light.max()) or 1.0
+    top = np.percentile(light, PICTURE_WHITE_PERCENTILE) or light.max() or 1.0
     toned = np.clip(light / np.float32(top), 0, 1) ** np.float32(PICTURE_GAMMA)
     palette = load_palette(scale.palette if scale.quantity == "intensity" else "grey")
     return palette[(255 * toned).astype(np.intp)]

@@ -215,7 +215,7 @@ class LayeredSource(Source):
         self.settings = tuple(settings)
         self.quantity = quantities.pop() if len(quantities) == 1 else "range"
         x = sources[0].view(0).cloud.xyz[:, 0]
-        self._width = float(np.ptp(x)) if x.size else 1.0
+        self._width = np.ptp(x) if x.size else 1.0
 
     def __len__(self) -> int:
         return len(self._lead)
@@ -271,7 +271,7 @@ class LayeredSource(Source):
     def _find_frame(self, source: Source, number: int) -> int:
         """Return the frame of a source that is shown with frame `number` of the first one."""
         if source is not self._lead and source.times is not None and self.times is not None:
-            return int(np.abs(source.times - self.times[number]).argmin())
+            return np.abs(source.times - self.times[number]).argmin()
         return min(max(number, source.inflow.oldest), len(source) - 1)
 
 

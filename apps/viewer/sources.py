@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -113,7 +113,7 @@ class VolumeSource(Source):
 
     def __init__(self, title: str, volume: Volume) -> None:
         rate = max(1.0, volume.grid.z.size / VOLUME_PLAY_TIME_S)
-        can_have_surface = min(volume.grid.shape) > 1 and bool(volume.magnitude.any())
+        can_have_surface = min(volume.grid.shape) > 1 and volume.magnitude.any()
         surface = (SURFACE_MODE,) if can_have_surface else ()
         modes = (PROJECTION_MODE, VOXEL_MODE, *surface, SLICE_MODE)
         self.mode = Choice("show as", modes, PROJECTION_MODE)
@@ -126,7 +126,7 @@ class VolumeSource(Source):
         self._make_view = functools.lru_cache(1)(self._make_view_of)
 
     def __len__(self) -> int:
-        return int(self.volume.grid.z.size)
+        return self.volume.grid.z.size
 
     def view(self, number: int) -> View:
         mode = self.mode.value
@@ -218,7 +218,8 @@ def make_look_method(name: str, weight: float | None = None) -> Method:
     """Return a method with few iterations, to look by; `weight` of its prior: its own by default."""
     takes = list_settings(METHODS[name])
     iterations = LOOK_ITERATIONS if {"iterations", "start"} & takes.keys() else None
-    return cast(Method, make_method(name, iterations=iterations, weight=weight))
+    made: Any = make_method(name, iterations=iterations, weight=weight)
+    return made
 
 
 class RecoveredSource(Source):
@@ -301,7 +302,7 @@ class RecoveredSource(Source):
 
 def find_near(times: FloatArray, time: float) -> slice:
     """Return the frames about a time."""
-    middle = int(np.searchsorted(times, time))
+    middle = np.searchsorted(times, time)
     return slice(max(0, middle - NEAR_FRAMES), middle + NEAR_FRAMES + 1)
 
 
@@ -347,7 +348,7 @@ class TransientSource(RecoveredSource):
         self.settings = (self.gate, self.half_gate, *self.settings)
 
     def __len__(self) -> int:
-        return int(self.frames.times.size)
+        return self.frames.times.size
 
     def find_gate(self, number: int) -> range:
         """Return the frames whose points are shown."""
@@ -369,7 +370,7 @@ class TransientSource(RecoveredSource):
         return replace(
             view,
             due=due,
-            time=float(times[number]),
+            time=times[number],
             caption=f"all {gate.stop} frames"
             if gate == every
             else f"frames {gate.start + 1} to {gate.stop}",
@@ -383,7 +384,7 @@ class TransientSource(RecoveredSource):
         return self.frames
 
     def recover_near(self, number: int, near: slice) -> Frames:
-        return cast(Frames, self.frames[near])
+        return self.frames[near]
 
     def pictures(self, number: int) -> Mapping[str, Picture]:
         gate = self.find_gate(number)

@@ -115,7 +115,7 @@ def has_working_graphics(probe: str = PROBE_SCRIPT) -> bool:
         done = subprocess.run([sys.executable, "-c", probe], timeout=PROBE_TIMEOUT_S, **quietly)
     except (OSError, subprocess.TimeoutExpired):
         return False
-    return bool(done.returncode == 0)
+    return done.returncode == 0
 
 
 def add_to_plotter(plotter: Any, shown: DisplayedFrame, point_px: int) -> None:
@@ -175,7 +175,7 @@ class SceneFigure:
         if len(xyz) > 1:
             _, _, depth = self.viewpoint.project(xyz, PICTURE_SHAPE_PX)
             focal_px = PICTURE_SHAPE_PX[0] / 2 / np.tan(self.viewpoint.field_of_view / 2)
-            touching = focal_px * measure_point_spacing(xyz) / float(np.nanmedian(depth))
+            touching = focal_px * measure_point_spacing(xyz) / np.nanmedian(depth)
             point_px = int(min(max(np.ceil(touching), point_px), MAX_POINT_PX))
         image = self._renderer.draw(shown, self.viewpoint, PICTURE_SHAPE_PX, point_px)
         self._image.set_data(image)
@@ -343,7 +343,7 @@ def open_window(session: Session) -> None:
     import pyvista
 
     title = f"tofclip: {session.source.title}"
-    plotter: Any = pyvista.Plotter(window_size=list(WINDOW_SIZE_PX), title=title)
+    plotter = pyvista.Plotter(window_size=list(WINDOW_SIZE_PX), title=title)
     window = DesktopWindow(session, plotter)
     plotter.add_timer_event(max_steps=10**9, duration=TICK_MS, callback=window.update)
     plotter.show()

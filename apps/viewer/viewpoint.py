@@ -93,14 +93,13 @@ class Box:
     def edges(self) -> FloatArray:
         """Both ends of the twelve edges, (12, 2, 3) in m."""
         bits = (np.arange(8)[:, np.newaxis] >> np.arange(3)) & 1
-        edges: FloatArray = np.where(bits, self.high, self.low)[np.array(EDGES)]
-        return edges
+        return np.where(bits, self.high, self.low)[np.array(EDGES)]
 
     def scale_bar(self, eye: FloatArray) -> FloatArray:
         """Ends of a bar of a round length, m, below the floor on the eye's side."""
         right = Viewpoint(eye, self.middle).axes[0]
         ahead, sides = np.cross(right, DOWN), self.high - self.low
-        width, depth = float(np.abs(right) @ sides), float(np.abs(ahead) @ sides)
+        width, depth = np.abs(right) @ sides, np.abs(ahead) @ sides
         length = round_length_down(SCALE_BAR_FRACTION * width) if width > 0 else 0.0
         middle = self.middle + (SCALE_BAR_DEPTH - 0.5) * depth * ahead
         middle[1] = self.high[1] + SCALE_BAR_DROP * sides[1]
@@ -126,7 +125,7 @@ def measure_point_spacing(xyz: Float32Array) -> float:
     thinned = xyz[:: max(1, len(xyz) // MAX_NEIGHBOUR_POINTS)]
     apart, _ = cKDTree(thinned).query(thinned, 2)
     # Of points on surfaces, n times as many are sqrt(n) times closer.
-    return float(np.median(apart[:, 1]) * np.sqrt(len(thinned) / len(xyz)))
+    return np.median(apart[:, 1]) * np.sqrt(len(thinned) / len(xyz))
 
 
 def round_length_down(length: float) -> float:
@@ -163,7 +162,7 @@ def place_viewpoint(xyz: Float32Array, aspect: float = 1.5) -> Viewpoint:
         return Viewpoint(np.array([0.0, 0.0, -1.0]), np.zeros(3))
     box = Box.around(xyz)
     middle, is_in_front = box.middle, box.low[2] > 0
-    away = float(np.linalg.norm(middle))
+    away = np.linalg.norm(middle)
     backwards = -middle / away if is_in_front else np.array([0.0, 0.0, -1.0])
     aside = np.array([np.tan(SIDEWAYS_TILT_RAD), -np.tan(UPWARD_TILT_RAD), 0.0])
     direction = (backwards + aside) / np.linalg.norm(backwards + aside)

@@ -1,10 +1,5 @@
 """Run the program in this process, on the files of a small instrument."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import tifffile
@@ -19,31 +14,29 @@ from small_instrument import (
 )
 
 from apps.verbs import nlos_imaging
-from tofclip.camera import Camera
-from tofclip.shots import Streak
 
 
 @pytest.fixture
-def shell(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Shell:
+def shell(request, tmp_path, monkeypatch):
     """Run the program in this process, in the test's own folder."""
     monkeypatch.chdir(tmp_path)
     return Shell(request)
 
 
 @pytest.fixture(scope="session")
-def camera() -> Camera:
+def camera():
     """Camera without skew, whose numbers made the small streak image."""
     return make_camera()
 
 
 @pytest.fixture(scope="session")
-def streak(camera: Camera) -> Streak:
+def streak(camera):
     """The shot of two squares, with Poisson noise."""
     return take_shot(camera, draw_squares())
 
 
 @pytest.fixture(scope="session")
-def files(tmp_path_factory: pytest.TempPathFactory, camera: Camera, streak: Streak) -> Path:
+def files(tmp_path_factory, camera, streak):
     """Folder with what a user would have: streak images, a camera file and four focus pictures."""
     folder = tmp_path_factory.mktemp("instrument")
     streak.save(folder / "streak.h5")
@@ -56,7 +49,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, camera: Camera, streak: Stre
 
 
 @pytest.fixture(scope="session")
-def curved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def curved(request, tmp_path_factory):
     """A hidden point before a curved wall of 24 x 24 points."""
     out = tmp_path_factory.mktemp("curved") / "capture.h5"
     Shell(request).figures(f"nlos simulate {HIDDEN_SCENE} --wall-points 24 --out {out}")
@@ -64,7 +57,7 @@ def curved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.fixture(scope="session")
-def confocal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def confocal(request, tmp_path_factory):
     """The same point before a planar wall of 32 x 32 points, scanned confocally."""
     out = tmp_path_factory.mktemp("confocal") / "capture.h5"
     scan = f"{HIDDEN_SCENE} --wall planar --scan confocal --wall-points 32"
@@ -73,25 +66,25 @@ def confocal(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.fixture(scope="session")
-def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def demo_folder(tmp_path_factory):
     """Where the demonstration puts its files."""
     return tmp_path_factory.mktemp("demo") / "new" / "demo"
 
 
 @pytest.fixture(scope="session")
-def demonstration(request: pytest.FixtureRequest, demo_folder: Path) -> dict[str, Any]:
+def demonstration(request, demo_folder):
     """Figures of `tofclip demo`; who asks for it is in the group ``golden``."""
     return Shell(request).figures("demo --out {demo_folder} --seed 1")
 
 
 @pytest.fixture(scope="session")
-def letters_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def letters_folder(tmp_path_factory):
     """Where the demonstration around the corner puts its files."""
     return tmp_path_factory.mktemp("letters") / "demo"
 
 
 @pytest.fixture(scope="session")
-def hidden_letters(request: pytest.FixtureRequest, letters_folder: Path) -> dict[str, Any]:
+def hidden_letters(request, letters_folder):
     """Figures of `tofclip nlos demo` on a coarser wall and with fewer voxels; who asks for it is in
     the group ``golden``.
     """

@@ -2,20 +2,15 @@
 squares at two ranges.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
 import shlex
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import numpy as np
-import pytest
 
 from apps.cli import main
 from tofclip.camera import Camera, SkewSweep
@@ -57,14 +52,14 @@ DEEP_CAMERA = Camera(
 """Its views move apart with range, which they are known to."""
 
 
-def make_camera(time_zero: float = 0.0) -> Camera:
+def make_camera(time_zero=0.0):
     """Camera without skew, for which light of range 0 arrives at a time, s."""
     at_rest, known = SkewSweep(CENTRES_PX, np.zeros(7), np.zeros(7)), {"time_zero": time_zero}
     shapes = IMAGE_SHAPE, SLIT_WIDTH_PX
     return Camera(CENTRES_PX, ANGLES, *shapes, sweep=at_rest, focal_length_px=140.0, **known)
 
 
-def draw_squares() -> np.ndarray:
+def draw_squares():
     """Frames (time, y, x) of both squares, each as long as a pulse."""
     frames = np.zeros((ROWS, *IMAGE_SHAPE), np.float32)
     sigma_bins = 60e-12 / BIN_WIDTH / 2.355
@@ -74,7 +69,7 @@ def draw_squares() -> np.ndarray:
     return frames
 
 
-def take_shot(camera: Camera, frames: np.ndarray, seed: int = 3) -> Streak:
+def take_shot(camera, frames, seed=3):
     """The shot of frames, with Poisson noise."""
     expected = camera.operator()(np.moveaxis(frames, 0, -1)).T + BACKGROUND
     counts = np.random.default_rng(seed).poisson(expected).astype(np.float32)
@@ -93,21 +88,21 @@ class Outcome:
 class Names(dict[str, Any]):
     """What stands in braces: what a test names, or else a fixture's value."""
 
-    def __init__(self, request: pytest.FixtureRequest, names: dict[str, Any]) -> None:
+    def __init__(self, request, names):
         super().__init__(names)
         self.request = request
 
-    def __missing__(self, name: str) -> Any:
+    def __missing__(self, name):
         return self.request.getfixturevalue(name)
 
 
 class Shell:
     """Runs the program in this process by lines as they are typed, with names in braces."""
 
-    def __init__(self, request: pytest.FixtureRequest) -> None:
+    def __init__(self, request):
         self.request = request
 
-    def __call__(self, line: str, **names: Any) -> Outcome:
+    def __call__(self, line, **names):
         known = Names(self.request, names)
         words = [word.format_map(known) for word in shlex.split(line)]
         out, err = io.StringIO(), io.StringIO()
@@ -117,16 +112,15 @@ class Shell:
             status = main(words)
         return Outcome(status, out.getvalue(), err.getvalue())
 
-    def figures(self, line: str, status: int = 0, said: str = "", **names: Any) -> dict[str, Any]:
+    def figures(self, line, status=0, said="", **names):
         """The object of `--json`: nothing else is printed, and nothing said but what is expected."""
         outcome = self(f"{line} --json", **names)
         assert outcome.status == status, outcome
         assert said in outcome.err if said else not outcome.err, outcome
         assert not status or all(line.startswith("tofclip: ") for line in outcome.err.splitlines())
-        found: dict[str, Any] = json.loads(outcome.out)
-        return found
+        return json.loads(outcome.out)
 
-    def refuses(self, line: str, said: str = "", **names: Any) -> str:
+    def refuses(self, line, said="", **names):
         """Whether the line is unusable and one line says why; return it."""
         outcome = self(line, **names)
         assert (outcome.status, outcome.out, outcome.err.count("\n")) == (2, "", 1), outcome
@@ -135,7 +129,7 @@ class Shell:
         return outcome.err
 
 
-def save_plate(path: Path, distance: float, photons: float, seed: int, late: float) -> None:
+def save_plate(path, distance, photons, seed, late):
     """Save the photon cube, (5, 6, 80) with bins of 80 ps, of a plate [m] so many seconds late."""
     noise = np.random.default_rng(seed)
     y, x = np.indices((5, 6)).reshape(2, -1)
@@ -148,7 +142,7 @@ def save_plate(path: Path, distance: float, photons: float, seed: int, late: flo
     np.save(path, cube.reshape(5, 6, 80).astype(np.uint16))
 
 
-def wall_shot(streak: Streak) -> Streak:
+def wall_shot(streak):
     """The same light, taken for what a relay wall of 12 x 12 points sent back."""
     x, y = np.meshgrid(np.linspace(-0.3, 0.3, 12), np.linspace(-0.3, 0.3, 12))
     wall = Record(
@@ -165,7 +159,7 @@ def wall_shot(streak: Streak) -> Streak:
     )
 
 
-def focus_pictures() -> dict[str, np.ndarray]:
+def focus_pictures():
     """A point source through the slit open and closed, with backgrounds, in counts."""
     noise = np.random.default_rng(5)
     row, column = np.mgrid[:120, :SLIT_WIDTH_PX].astype(float)
@@ -182,9 +176,7 @@ def focus_pictures() -> dict[str, np.ndarray]:
     return {name: noise.poisson(picture + 100).astype(np.uint16) for name, picture in light.items()}
 
 
-def write_views(
-    path: Path, views: list[tuple[int, int]], picture: Callable[..., Any]
-) -> LightField:
+def write_views(path, views, picture):
     """Save the light field whose picture at a view (v, u) a function returns."""
     pictures = np.stack([picture(*view) for view in views]).astype(np.float32)
     field = LightField(pictures, np.array(views, float))
@@ -192,13 +184,13 @@ def write_views(
     return field
 
 
-def two_cards(folder: Path) -> None:
+def two_cards(folder):
     """A near card before a far one, 48 pixels and 4 x 4 views, what a camera measures of it, and a
     map of its depths.
     """
     y, x = np.mgrid[:48, :48].astype(float)
 
-    def look(v: int, u: int) -> np.ndarray:
+    def look(v, u):
         near = (abs(x + u - 24) < 8) & (abs(y + v - 24) < 8)
         far = 0.2 + 0.4 * (np.floor((x - u) / 5) % 2)
         chequers = 0.4 + 0.6 * ((np.floor((x + u) / 3) + np.floor((y + v) / 3)) % 2)

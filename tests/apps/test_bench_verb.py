@@ -1,7 +1,5 @@
 """Benchmarks: every case runs, what is measured is what was done, and the page says it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time
@@ -97,11 +95,11 @@ def test_the_choice_of_a_weight_is_part_of_the_work(weight_searches):
         assert list(timed.peers) == (["LenslessPiCam"] if case.name == "clip-lensless" else [])
 
 
-def made_up(size: int) -> PreparedCase:
-    def absent() -> float:
+def made_up(size):
+    def absent():
         raise PeerUnavailableError("other: is not here")
 
-    def work() -> None:
+    def work():
         np.ones(size << 17)  # so many MiB
         time.sleep(0.04)
 
@@ -115,7 +113,7 @@ MADE_UP = Case(
 )
 
 
-def runs_of(case: Case, peers: str | None = None) -> list[dict]:
+def runs_of(case, peers=None):
     return run_cases([case], peers, lambda _: None)["entries"][0]["runs"]
 
 
@@ -193,7 +191,7 @@ def test_a_case_that_fails_is_told_and_stops_nothing(monkeypatch):
 
 
 def test_the_page_tells_growth_spread_and_peers():
-    def result(size: int, threads: int, median: float) -> dict:
+    def result(size, threads, median):
         spread = {"least": 0.9 * median, "greatest": 1.2 * median, "repeats": 5}
         absent = {"absent": "ASTRA: --peers names no Python"}
         return {

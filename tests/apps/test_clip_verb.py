@@ -1,7 +1,5 @@
 """`tofclip clip`, from light field to scored picture."""
 
-from __future__ import annotations
-
 import h5py
 import numpy as np
 import OpenEXR
@@ -15,7 +13,7 @@ LETTERS = "{shared_data}/lightfields/render_letters.npz"
 SCORES = {"nmse", "nmse_whole_frame", "nmse_energy"}
 
 
-def simulate(shell, encoder: str, ratio: float) -> int:
+def simulate(shell, encoder, ratio):
     words = f"--encoder {encoder} --sampling-ratio {ratio} --out meas.h5"
     return shell.figures(f"clip simulate {LETTERS} {words}")["readings"]
 

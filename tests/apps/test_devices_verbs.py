@@ -1,7 +1,5 @@
 """tofclip devices and tofclip record, on emulated instruments."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

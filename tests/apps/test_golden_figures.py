@@ -4,20 +4,15 @@
 and tolerance. A change that moves one on purpose, for the better or at a price, changes the file.
 """
 
-from __future__ import annotations
-
 import json
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.io import loadmat
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
-from small_instrument import Shell
 
 from nlos import Capture, settings_for
 from nlos.known_scenes import HiddenTruth
@@ -33,7 +28,7 @@ pytestmark = pytest.mark.xdist_group("golden")
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "figures.json").read_text("utf-8"))
 
 
-def compare(scene: str, found: Mapping[str, Any]) -> None:
+def compare(scene, found):
     kept = GOLDEN[scene]["figures"]
     changed = [
         f"{scene}: {name} is {found[name]:.6g}, was {value:.6g} +- {tolerance:.2g}"
@@ -43,13 +38,13 @@ def compare(scene: str, found: Mapping[str, Any]) -> None:
     assert not changed, "\n".join(["against tests/golden/figures.json:", *changed])
 
 
-def require(path: Path) -> Path:
+def require(path):
     if not path.is_file():
         pytest.skip(f"no recorded {path}")
     return path
 
 
-def test_the_demonstration(demonstration: dict[str, Any], demo_folder: Path) -> None:
+def test_the_demonstration(demonstration, demo_folder):
     found = demonstration
     compare("demo", found)
     # What it promises: half a bin at the median, and one bin for 95 % of the pixels with a return.
@@ -74,9 +69,7 @@ def test_the_demonstration(demonstration: dict[str, Any], demo_folder: Path) -> 
     np.testing.assert_array_equal(nominal.gains, 1)
 
 
-def test_the_hidden_letters_on_a_coarser_wall(
-    hidden_letters: dict[str, Any], letters_folder: Path
-) -> None:
+def test_the_hidden_letters_on_a_coarser_wall(hidden_letters, letters_folder):
     hybrid, flat = hidden_letters["hybrid"], hidden_letters["flat"]
     assert hybrid["correlation"] > 0.999
     assert flat["correlation"] < 0.95
@@ -87,7 +80,7 @@ def test_the_hidden_letters_on_a_coarser_wall(
 
 
 @pytest.mark.nightly
-def test_the_hidden_letters(shell: Shell) -> None:
+def test_the_hidden_letters(shell):
     found = shell.figures("nlos demo --out letters --seed 1")
     methods = {name: entry for name, entry in found.items() if isinstance(entry, dict)}
     compare(
@@ -96,7 +89,7 @@ def test_the_hidden_letters(shell: Shell) -> None:
     )
 
 
-def measure_wall(path: Path) -> dict[str, float]:
+def measure_wall(path):
     """A recorded letter around the corner, by the linear inverse and the settings that suit it."""
     frames = recover(open_shot(path).streak, method="linear")
     capture = Capture.from_frames(frames)
@@ -114,33 +107,33 @@ def measure_wall(path: Path) -> dict[str, float]:
 
 
 @pytest.mark.nightly
-def test_the_recorded_letter_n(shared_data: Path) -> None:
+def test_the_recorded_letter_n(shared_data):
     compare("LetterN", measure_wall(require(shared_data / "lift" / "nlos_LetterN.npz")))
 
 
 @pytest.fixture(scope="module")
-def clip(shared_data: Path) -> Path:
+def clip(shared_data):
     return require(shared_data / "clip" / "scene5.tif").parent
 
 
 @pytest.fixture(scope="module")
-def scene5_camera(clip: Path) -> Camera:
+def scene5_camera(clip):
     names = ("LinePattern", "LinePattern_bkg", "DotPattern", "DotPattern_bkg")
     pictures = [read_streak(clip / f"{name}.tif").counts for name in names]
     return calibrate_views(*pictures).camera(time_zero=-10.784e-9)
 
 
-def sum_energy(frames: Frames) -> np.ndarray:
+def sum_energy(frames):
     return frames.values.sum(axis=(1, 2), dtype=np.float64) * frames.times**2
 
 
 @pytest.fixture(scope="module")
-def frames(clip: Path, scene5_camera: Camera) -> Frames:
+def frames(clip, scene5_camera):
     """Of the recorded shot of letters and shelves."""
     return recover(read_streak(clip / "scene5.tif"), scene5_camera, "linear")
 
 
-def measure_scene5(frames: Frames) -> dict[str, float]:
+def measure_scene5(frames):
     returns = depth(frames)
     return {
         "relative_residual": frames.figures["relative_residual"],
@@ -151,12 +144,12 @@ def measure_scene5(frames: Frames) -> dict[str, float]:
     }
 
 
-def test_the_recorded_scene5(frames: Frames) -> None:
+def test_the_recorded_scene5(frames):
     compare("scene5 linear", measure_scene5(frames))
 
 
 @pytest.mark.nightly
-def test_the_recorded_scene5_by_l1(clip: Path, scene5_camera: Camera) -> None:
+def test_the_recorded_scene5_by_l1(clip, scene5_camera):
     found = recover(read_streak(clip / "scene5.tif"), scene5_camera, "l1")
     compare("scene5 l1", measure_scene5(found))
 
@@ -169,30 +162,30 @@ class TestLetters:
     FEW_ROWS = slice(50, 230)
 
     @pytest.fixture(scope="class")
-    def letters(self, clip: Path, frames: Frames) -> Frames:
+    def letters(self, clip, frames):
         """Of a few rows, by a method that sharpens strokes."""
         streak = read_streak(clip / "scene5.tif")
         counts, times = streak.counts[self.FEW_ROWS], streak.times[self.FEW_ROWS]
         few = replace(streak, counts=counts, row_times=times, saturated=None)
         return recover(few, frames.camera, Sparse(iterations=25))
 
-    def test_the_views_are_skewed_as_the_trial_found(self, frames: Frames) -> None:
+    def test_the_views_are_skewed_as_the_trial_found(self, frames):
         found = frames.camera.sweep.raw_position(np.zeros(7), frames.camera.centres_px)[0]
         np.testing.assert_allclose(found - found[3], self.SKEW_ROWS, atol=1.0)
 
-    def test_objects_stand_where_the_trial_found_them(self, frames: Frames) -> None:
+    def test_objects_stand_where_the_trial_found_them(self, frames):
         energy = sum_energy(frames)
         peaks, _ = find_peaks(energy, prominence=0.01 * energy.max())
         distances = [int(np.abs(peaks - row).min()) for row in self.PEAK_ROWS]
         assert max(distances) <= 3, distances
 
-    def test_ranges_use_the_file_s_own_time_axis(self, frames: Frames) -> None:
+    def test_ranges_use_the_file_s_own_time_axis(self, frames):
         step = np.diff(frames.times)
         assert step[[0, -1]] == pytest.approx([18.78e-12, 20.49e-12], abs=0.02e-12)
         assert SPEED_OF_LIGHT / 2 * frames.times[0] == pytest.approx(1.63, abs=0.02)
 
     @pytest.mark.parametrize("row", [93, 182], ids=["U", "N"])
-    def test_a_letter_s_strokes_are_apart(self, letters: Frames, row: int) -> None:
+    def test_a_letter_s_strokes_are_apart(self, letters, row):
         """U and N have two upright strokes: their middle rows show two maxima with a clear gap
         between them.
         """
@@ -203,7 +196,7 @@ class TestLetters:
         assert find_peaks(profile, prominence=0.2 * profile.max())[0].size == 2
 
 
-def measure_face(folder: Path) -> dict[str, float]:
+def measure_face(folder):
     """Share of the head within 12 mm, error and truth of deviations, against a long exposure."""
     cells = loadmat(folder / "shin2015_face.mat")["Ts"]
     number = np.array([cell.size for cell in cells.ravel()])
@@ -225,6 +218,6 @@ def measure_face(folder: Path) -> dict[str, float]:
     }
 
 
-def test_the_recorded_face(shared_data: Path) -> None:
+def test_the_recorded_face(shared_data):
     folder = require(shared_data / "photons" / "shin2015_face.mat").parent
     compare("face", measure_face(folder))

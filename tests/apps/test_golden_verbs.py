@@ -4,15 +4,11 @@ A line of `golden/verbs.txt` is an argument, an option or a key. Whoever adds or
 changes the file by hand; the failure names the lines.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +31,7 @@ NOT_RUN = {"warm-up": "compiles every loop of the program; test_program holds it
 """Verbs whose keys are not recorded, and why."""
 
 
-def list_options(verb: str) -> Iterator[str]:
+def list_options(verb):
     """One line for each argument and option of a verb."""
     for param in VERBS[verb].get_params(typer.Context(VERBS[verb], info_name=verb)):
         if param.name == "help":
@@ -53,7 +49,7 @@ def list_options(verb: str) -> Iterator[str]:
         yield f"{verb}: {' '.join([*words, *limits, *repeated])}, {needed}"
 
 
-def list_keys(value: Any, path: str = "") -> Iterator[str]:
+def list_keys(value, path=""):
     """The keys of nested mappings, without values; what stands in lists counts once."""
     if isinstance(value, dict):
         for key, entry in value.items():
@@ -72,7 +68,7 @@ PLATES = [
 ]
 
 
-def provide(folder: Path, files: Path, curved: Path) -> None:
+def provide(folder, files, curved):
     """Put into a folder what the lines below read."""
     for name, file in (("shots", files / "streak.h5"), ("captures", curved)):
         (folder / name).mkdir()
@@ -177,33 +173,33 @@ def keys(request, tmp_path_factory, files, curved, demonstration, hidden_letters
     }
 
 
-def read_golden(verb: str) -> list[str]:
+def read_golden(verb):
     lines = GOLDEN.read_text("utf-8").splitlines()
     return [line for line in lines if line.startswith(f"{verb}: ")]
 
 
-def compare(made: list[str], kept: list[str]) -> None:
+def compare(made, kept):
     changed = [f"lost  {line}" for line in kept if line not in made]
     changed += [f"new   {line}" for line in made if line not in kept]
     assert not changed, "\n".join(["against tests/golden/verbs.txt:", *changed])
 
 
-def is_key(line: str) -> bool:
+def is_key(line):
     return ": --json " in line and not line.endswith(", default False")
 
 
-def test_verbs_are_those_of_the_file() -> None:
+def test_verbs_are_those_of_the_file():
     named = {line.partition(": ")[0] for line in GOLDEN.read_text("utf-8").splitlines()}
     assert named == set(VERBS)
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_arguments_and_options(verb: str) -> None:
+def test_arguments_and_options(verb):
     compare([*list_options(verb)], [line for line in read_golden(verb) if not is_key(line)])
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_keys_of_json(verb: str, keys: dict[str, list[str]]) -> None:
+def test_keys_of_json(verb, keys):
     if verb in NOT_RUN:
         assert verb not in keys, f"{verb} is run: take it off the list"
         return

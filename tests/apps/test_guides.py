@@ -2,8 +2,6 @@
 small instrument, and their drawings agree with what is computed.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -85,7 +83,7 @@ def test_what_a_guide_shows_and_cannot_run(guide, tmp_path, monkeypatch):
         read_command(command)
 
 
-def read_command(command: str) -> None:
+def read_command(command):
     """Whether a command is one of this program; what it names is made, as it has to be there."""
     known, words = collect_verbs(), shlex.split(command)[1:]
     for word in words:
@@ -204,7 +202,7 @@ def test_memory_limits_are_those_of_the_code():
 
 
 class TestReadme:
-    def commands(self, start: str) -> list[str]:
+    def commands(self, start):
         """Lines of the README's shell blocks that begin with `start`."""
         blocks = re.findall(r"```sh\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
         return [line for block in blocks for line in block.splitlines() if line.startswith(start)]
@@ -265,7 +263,7 @@ class TestReadme:
         (recover,) = self.commands("tofclip recover shot.tif")
         zero = shlex.split(recover)[-1]
         assert f"time_zero={zero}e-9" in code  # the same ranges as by the commands
-        names: dict = {}
+        names = {}
         exec(code, names)
         assert names["frames"].camera.time_zero == pytest.approx(float(zero) * 1e-9)
         assert Path("scene.ply").stat().st_size > 0

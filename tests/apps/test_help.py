@@ -2,8 +2,6 @@
 is forgotten.
 """
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess
@@ -87,7 +85,7 @@ def test_a_long_example_is_still_one_command_for_a_shell():
 
 @pytest.mark.parametrize("shell_name", ["bash", "zsh", "fish"])
 def test_shells_complete_verbs_options_and_names(shell, monkeypatch, shell_name):
-    def complete(line: str) -> str:
+    def complete(line):
         """Ask for completions of a command line as the shell's function does."""
         asked = {
             COMPLETION_VARIABLE: f"complete_{shell_name}",

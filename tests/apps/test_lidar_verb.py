@@ -1,7 +1,5 @@
 """`tofclip lidar`: ranging against its limit, depth-locked recovery, sequences and objects."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +20,7 @@ from tofclip.simulate import (
 from tofclip.simulate.patterns import make_checkerboard
 
 
-def scene(*plates: tuple[float, float]) -> Scene:
+def scene(*plates):
     """Plates at distances [m] and places [px] along the picture's diagonal."""
     pattern = make_checkerboard(3, 0.1, 0.9)
     lengths = [(distance, place * distance / 100.0) for distance, place in plates]
@@ -34,7 +32,7 @@ def scene(*plates: tuple[float, float]) -> Scene:
     )
 
 
-def instrument(bins: int = 150, photons: float = 2e5) -> Instrument:
+def instrument(bins=150, photons=2e5):
     return Instrument(CAMERA, StreakDetector(bins, 100e-12, peak_photons=photons))
 
 

@@ -1,7 +1,5 @@
 """`tofclip nlos compare` and `film`: methods side by side, what they cost, and the flash."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

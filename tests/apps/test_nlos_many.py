@@ -2,8 +2,6 @@
 stream`, a moving scene by one plan.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import threading

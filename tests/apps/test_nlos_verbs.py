@@ -1,7 +1,5 @@
 """`tofclip nlos`: captures simulated, described, imaged, refined and traced to surfaces."""
 
-from __future__ import annotations
-
 import shlex
 import tomllib
 from dataclasses import replace

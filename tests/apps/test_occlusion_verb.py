@@ -1,7 +1,5 @@
 """`tofclip occlusion`, its live demonstration, and the studies of seeing through occluders."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import time

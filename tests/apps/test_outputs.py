@@ -2,8 +2,6 @@
 line, with nothing written. And what the program writes, `tofclip.load`, `info` and `view` open.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +64,7 @@ FURTHER_WORDS = {
 """What a verb has to be given besides its arguments and --out."""
 
 
-def is_file(param) -> bool:
+def is_file(param):
     """Whether a parameter's value names a file or a folder, or may."""
     descriptor = getattr(param, "type_descriptor", None)
     if descriptor is None or param.name in NO_FILES:
@@ -90,7 +88,7 @@ PAIRS = [
 """Every verb's outputs with each of its inputs."""
 
 
-def spell(path: Path) -> list[Path]:
+def spell(path):
     """All names of a file or a folder of the working directory; links are made beside it."""
     symbolic, hard = path.with_stem("symbolic"), path.with_stem("hard")
     symbolic.symlink_to(path)
@@ -102,7 +100,7 @@ def spell(path: Path) -> list[Path]:
     return names
 
 
-def take_stock(folder: Path) -> dict[str, bytes | None]:
+def take_stock(folder):
     """All that is in a folder: files with their content, and folders."""
     return {
         str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
@@ -119,14 +117,14 @@ def here(shell, tmp_path, monkeypatch):
     return folder
 
 
-def make_input(path: Path) -> Path:
+def make_input(path):
     # A comment in TOML, too: settings are read before any other file is.
     path.parent.mkdir(exist_ok=True)
     path.write_text("# an input\n")
     return path
 
 
-def build_line(verb: str, out: str, name: str, given: Path) -> str:
+def build_line(verb, out, name, given):
     """Everything but the output under test; files that are not under test do not matter."""
     words = [verb, FURTHER_WORDS.get(verb, "")]
     for param in VERBS[verb].params:

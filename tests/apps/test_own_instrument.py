@@ -1,12 +1,8 @@
 """An instrument of one's own, in one file, by every verb; and what its histograms become."""
 
-from __future__ import annotations
-
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +11,7 @@ from tcp_histograms import BIN_S, BINS, HEADER, PICTURE_BYTES, SIDE
 
 import devices
 from devices import registry
-from devices.emulation.harness import HOST, Connection, LoopbackServer
+from devices.emulation.harness import HOST, LoopbackServer
 from tofclip.camera import Camera
 from tofclip.lidar import PointCloud
 from tofclip.lidar.ros import MESSAGE_TYPE, read_bag
@@ -25,7 +21,7 @@ SIGNAL, BACKGROUND, PULSE_S = 20.0, 0.02, 300e-12  # photons, photons a bin, sta
 BIN_M = BIN_S * SPEED_OF_LIGHT / 2
 
 
-def draw_scene(shift_m: float = 0.0) -> np.ndarray:
+def draw_scene(shift_m=0.0):
     """Range of each pixel, m: a slanted wall, and a box in front of it."""
     y, x = np.indices((SIDE, SIDE))
     ranges = 3.0 + 0.01 * x + 0.005 * y
@@ -33,7 +29,7 @@ def draw_scene(shift_m: float = 0.0) -> np.ndarray:
     return ranges
 
 
-def draw_histograms(ranges: np.ndarray, seed: int) -> np.ndarray:
+def draw_histograms(ranges, seed):
     """Photons (y, x, bins)."""
     times = BIN_S * (np.arange(BINS) + 0.5)
     off = times - 2 * ranges[..., np.newaxis] / SPEED_OF_LIGHT
@@ -45,13 +41,13 @@ def draw_histograms(ranges: np.ndarray, seed: int) -> np.ndarray:
 class HistogramServer:
     """Sends pictures, `rate` a second, to who connects; number 3 is never sent."""
 
-    def __init__(self, ranges: np.ndarray, rate: float = 25.0) -> None:
+    def __init__(self, ranges, rate=25.0):
         self.drawn = [draw_histograms(ranges, seed).tobytes() for seed in range(64)]
         self.rate, self._closing = rate, threading.Event()
         self._server = LoopbackServer(self._serve)
         self.address = f"histograms://{HOST}:{self._server.port}"
 
-    def _serve(self, connection: Connection) -> None:
+    def _serve(self, connection):
         began, number = time.monotonic(), 0
         while not self._closing.wait(max(0.0, began + number / self.rate - time.monotonic())):
             if number != 3:
@@ -59,13 +55,13 @@ class HistogramServer:
                 connection.send(HEADER.pack(number, PICTURE_BYTES) + data)
             number += 1
 
-    def close(self) -> None:
+    def close(self):
         self._closing.set()
         self._server.close()
 
 
 @pytest.fixture
-def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def address(monkeypatch):
     monkeypatch.setattr(registry.SOURCES, "registered", {})
     devices.register_source("histograms", tcp_histograms.open_histograms)
     server = HistogramServer(draw_scene())
@@ -73,7 +69,7 @@ def address(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     server.close()
 
 
-def list_errors(cloud: PointCloud) -> np.ndarray:
+def list_errors(cloud):
     """Error of each point's range over its deviation; a point's pixel follows from where it looks."""
     camera = Camera.pinhole((SIDE, SIDE), 40.0)
     x, y = (
@@ -83,7 +79,7 @@ def list_errors(cloud: PointCloud) -> np.ndarray:
     return (cloud.range - draw_scene()[y, x]) / cloud.range_sigma
 
 
-def test_one_file_and_every_verb(shell: Any, address: str) -> None:
+def test_one_file_and_every_verb(shell, address):
     assert len(Path(tcp_histograms.__file__).read_text().splitlines()) <= 120
     live = shell.figures(f"stream {address} --shots 12 --out live")
     assert (live["method"], live["clouds"]) == ("photons", 12)

@@ -2,8 +2,6 @@
 pictures choose to show.
 """
 
-from __future__ import annotations
-
 import json
 import signal
 import threading
@@ -235,15 +233,13 @@ SAMPLES = st.builds(
 
 
 @given(sample=SAMPLES)
-def test_what_is_written_is_read_back_to_the_last_bit(
-    sample: Sample, tmp_path_factory: pytest.TempPathFactory
-):
+def test_what_is_written_is_read_back_to_the_last_bit(sample, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "sample.toml"
     save_settings(sample, path, "a sample")
     assert repr(load_settings(Sample, path, {})) == repr(sample)  # as text, for -0.0 equals 0.0
 
 
-def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path):
+def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path):
     path = tmp_path / "settings.toml"
     path.write_text("length_m = 3\ncount = 5\nends_m = [1, 2.5]\n")
     found = load_settings(Sample, path, {"count": 7, "name": None, "whole": False})
@@ -254,7 +250,7 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path):
 
 
 @given(st.decimals(1, 9999, places=4).map(float))
-def test_lengths_in_mm_are_metres_inside_and_come_back_as_they_were(facet_mm: float):
+def test_lengths_in_mm_are_metres_inside_and_come_back_as_they_were(facet_mm):
     found = load_settings(Sample, None, {"facet_mm": facet_mm})
     assert found.facet == facet_mm * 1e-3
     assert settings_to_dict(found)["facet_mm"] == facet_mm
@@ -276,7 +272,7 @@ def test_lengths_in_mm_are_metres_inside_and_come_back_as_they_were(facet_mm: fl
         ("[table]\na = 1", "no setting is called 'table'"),
     ],
 )
-def test_what_makes_no_sense_is_refused(text: str, complaint: str, tmp_path: Path):
+def test_what_makes_no_sense_is_refused(text, complaint, tmp_path):
     path = tmp_path / "settings.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=r"settings\.toml") as caught:
@@ -285,7 +281,7 @@ def test_what_makes_no_sense_is_refused(text: str, complaint: str, tmp_path: Pat
 
 
 @pytest.mark.parametrize("content", [b"length_m = = 1", b"name = '\xff'"])
-def test_files_that_are_no_toml(content: bytes, tmp_path: Path):
+def test_files_that_are_no_toml(content, tmp_path):
     path = tmp_path / "settings.toml"
     path.write_bytes(content)
     with pytest.raises(FileFormatError, match="is not a TOML file of settings"):
@@ -299,7 +295,7 @@ def test_walls_are_those_of_the_simulation():
 
 
 @pytest.mark.parametrize("kind", [ReconstructSettings, CompareSettings, SceneSettings])
-def test_every_setting_can_be_told_by_a_file(kind: type, tmp_path: Path):
+def test_every_setting_can_be_told_by_a_file(kind, tmp_path):
     """Values of each field's own type go out and come back."""
     examples = {"float": 0.5, "int": 3, "str": "a", "bool": True, "list[str]": ["cycles=3"]}
     examples["tuple[float, float]"] = (0.5, 1.5)

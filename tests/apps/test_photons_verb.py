@@ -2,8 +2,6 @@
 and a plate to a camera file.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -27,7 +25,7 @@ FIELDS = {"range_m", "range_sigma_m", "intensity", "outlier_probability"}
 PULSE = "--bin-width-ps 80 --pulse-ps 400"
 
 
-def load(name: str = "range.npz") -> dict[str, np.ndarray]:
+def load(name="range.npz"):
     with np.load(name) as written:
         return dict(written)
 
@@ -101,7 +99,7 @@ def test_a_hot_pixel_is_counted_and_changes_nothing(shell, ball, surface):
         assert np.mean(np.abs(found - surface)[seen] < 5) > 0.95
 
 
-def assert_gates_show_the_scene(bound_m: float) -> None:
+def assert_gates_show_the_scene(bound_m):
     """Median error of a gated array of 32 x 32 where a pixel sees one distance."""
     delays = render_array_delays().reshape(32, 16, 32, 16)
     even = delays.max(axis=(1, 3)) - delays.min(axis=(1, 3)) < 1e-11

@@ -2,17 +2,13 @@
 with, and settings that are given as texts.
 """
 
-from __future__ import annotations
-
 import configparser
 import os
 import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +22,7 @@ from nlos.settings import METHODS as HIDDEN_SCENE_METHODS
 from nlos.settings import Settings
 from tofclip.errors import FileFormatError, InputError
 from tofclip.loading import outline
-from tofclip.plugins import DENOISERS, METHODS, READERS, Parts, Reader, list_settings
+from tofclip.plugins import DENOISERS, METHODS, READERS, Reader, list_settings
 from tofclip.recovery import make_method
 from tofclip.solvers import PlugAndPlay, RegularisationByDenoising, TotalVariation
 
@@ -88,7 +84,7 @@ broken = mine:absent
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def package(tmp_path, monkeypatch):
     """A package that offers parts, installed for one test."""
     place = tmp_path / "installed"
     (place / "mine-1.0.dist-info").mkdir(parents=True)
@@ -103,14 +99,14 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     forget()
 
 
-def forget() -> None:
+def forget():
     for parts in EVERY:
         for name in ("_points", "offered"):
             vars(parts).pop(name, None)
 
 
 @pytest.mark.parametrize("parts", EVERY, ids=lambda parts: parts.group)
-def test_a_name_stays_and_what_it_names_is_there(parts: Parts) -> None:
+def test_a_name_stays_and_what_it_names_is_there(parts):
     named = KEPT[parts.group].split()
     for name in named:
         assert name in parts.own, (
@@ -122,7 +118,7 @@ def test_a_name_stays_and_what_it_names_is_there(parts: Parts) -> None:
         assert callable(parts[name]) or isinstance(parts[name], Reader)
 
 
-def install(guide: Path, place: Path) -> None:
+def install(guide, place):
     """Write the files that a page shows, each named by its first line, as pip would install them."""
     blocks = re.findall(r"^```(?:python|toml)\n# (\S+)\n(.*?)^```", guide.read_text(), re.M | re.S)
     for name, text in blocks:
@@ -143,7 +139,7 @@ LENGTHS = {"denoiser": 25, "prior": 40, "method": 50, "hidden": 50, "reader": 40
 
 
 @pytest.mark.nightly
-def test_the_page_makes_a_package_whose_parts_are_used(tmp_path: Path) -> None:
+def test_the_page_makes_a_package_whose_parts_are_used(tmp_path):
     install(PAGE, tmp_path / "installed")
     found = {one.stem: len(one.read_text().splitlines()) for one in tmp_path.rglob("my_parts/*.py")}
     assert found.keys() == LENGTHS.keys()
@@ -169,13 +165,13 @@ def test_the_page_makes_a_package_whose_parts_are_used(tmp_path: Path) -> None:
     assert found_at == pytest.approx((0.1, -0.05, 0.6), abs=0.03)
 
 
-def test_nothing_is_looked_for_before_it_is_needed() -> None:
+def test_nothing_is_looked_for_before_it_is_needed():
     code = "import sys, tofclip.plugins as p, apps.cli; p.METHODS['tv']; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "importlib.metadata" not in done.stdout.split()
 
 
-def test_parts_of_a_package_are_used(package: Path, tmp_path: Path, shell: Any) -> None:
+def test_parts_of_a_package_are_used(package, tmp_path, shell):
     made = make_method("pnp", denoiser="half", share="0.25", strength="0.2", iterations=7)
     assert (made.denoiser.share, made.strength, made.start.iterations) == (0.25, 0.2, 7)
     (tmp_path / "shot.txt").write_text("MINE 3")
@@ -189,14 +185,14 @@ def test_parts_of_a_package_are_used(package: Path, tmp_path: Path, shell: Any) 
         tofclip.read_streak(tmp_path / "other.txt")
 
 
-def test_instruments_of_a_package_are_found(package: Path) -> None:
+def test_instruments_of_a_package_are_found(package):
     found = {one.uri: one for one in devices.discover()}
     assert found["mine://7"].instrument == "my instrument"
     broken = found["broken://"]
     assert (broken.instrument, "does not load" in broken.note) == ("mine 1.0", True)
 
 
-def test_what_is_wrong_with_a_package_is_a_line(package: Path, shell: Any) -> None:
+def test_what_is_wrong_with_a_package_is_a_line(package, shell):
     listed = shell.figures("plugins")["parts"]
     own = {(one["name"], one["fault"]) for one in listed if one["origin"] == "mine 1.0"}
     names, faults = [name for name, _ in own], [fault for _, fault in own if fault]
@@ -215,7 +211,7 @@ def test_what_is_wrong_with_a_package_is_a_line(package: Path, shell: Any) -> No
     assert "Read ``MINE``" in shell("plugins texts").out
 
 
-def test_a_notebook_registers_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_registers_a_part(monkeypatch):
     monkeypatch.setattr(METHODS, "registered", {})
     tofclip.register_method("mine", lambda weight=1.0: TotalVariation(weight))
     assert make_method("mine", weight="0.5") == TotalVariation(0.5)
@@ -236,20 +232,20 @@ def test_a_notebook_registers_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"denoiser": "nlm", "patch_px": "a"}, "'nlm': patch_px must be a whole number"),
     ],
 )
-def test_a_setting_that_cannot_be_is_refused(settings: dict[str, str], said: str) -> None:
+def test_a_setting_that_cannot_be_is_refused(settings, said):
     with pytest.raises(InputError, match=said):
         make_method("pnp", **settings)
 
 
-def test_methods_with_a_denoiser_are_named() -> None:
+def test_methods_with_a_denoiser_are_named():
     assert make_method("pnp", weight=2e-3) == PlugAndPlay(TotalVariation(2e-3))
     assert make_method("red", coupling="0.2") == RegularisationByDenoising(coupling=0.2)
 
 
-def test_a_hidden_scene_method_takes_what_it_names() -> None:
+def test_a_hidden_scene_method_takes_what_it_names():
     for name in HIDDEN_SCENE_METHODS.own:
         assert {*list_settings(HIDDEN_SCENE_METHODS[name])} & {"wavelength", "sigma", "falloff"}
-    made: Any = Settings(wavelength=0.1, sigma=0.3).make_method("filtered-backprojection")
+    made = Settings(wavelength=0.1, sigma=0.3).make_method("filtered-backprojection")
     assert np.isclose(made.sigma, 0.3)
     wanted = Settings(wavelength=0.1, method="hybrid", set=["plane_z=0.4"])
     assert (wanted.make_method().plane_z, wanted.make_method("rsd").cycles) == (0.4, 3.0)

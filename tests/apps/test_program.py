@@ -2,8 +2,6 @@
 that are missing, and loops compiled beforehand.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import pty
@@ -31,7 +29,7 @@ LONGEST_WAIT_S = 120.0  # compiling the kernels on a slow, cold machine
 VERBS = collect_verbs()
 
 
-def start(command, folder: Path = ROOT, path: Path = ROOT, **environment: str):
+def start(command, folder=ROOT, path=ROOT, **environment):
     """Run a command until it ends, with a folder before all others on Python's path."""
     return subprocess.run(
         [*map(str, command)],
@@ -44,7 +42,7 @@ def start(command, folder: Path = ROOT, path: Path = ROOT, **environment: str):
     )
 
 
-def start_python(code: str, *words: str):
+def start_python(code, *words):
     return start([sys.executable, "-c", code, *words])
 
 
@@ -150,7 +148,7 @@ sys.exit(cli.main(sys.argv[1:]))
         assert len(READERS) == 22
 
 
-def read_terminal(terminal: int, until: str = "") -> str:
+def read_terminal(terminal, until=""):
     """What is written on a terminal: until a text appears, or up to the end."""
     seen = ""
     while not until or until not in seen:

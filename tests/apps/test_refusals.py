@@ -3,14 +3,11 @@
 The table is a text: a line is what a user types and what is said.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import resource
 import shutil
 import signal
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,9 +24,9 @@ from tofclip.shots import Returns
 TABLE = Path(__file__).with_name("refusals.txt")
 
 
-def read_table() -> Iterator[tuple[str, str]]:
+def read_table():
     """What is typed, and a piece of what is said."""
-    names: dict[str, str] = {}
+    names = {}
     for line in TABLE.read_text("utf-8").splitlines():
         typed, arrow, said = line.partition(" => ")
         if arrow:
@@ -110,7 +107,7 @@ def cards(tmp_path_factory):
     return folder
 
 
-def take_stock(*folders: Path) -> dict[Path, tuple[int, int]]:
+def take_stock(*folders):
     stats = {path: path.stat() for folder in folders for path in folder.rglob("*")}
     return {path: (stat.st_size, stat.st_mtime_ns) for path, stat in stats.items()}
 
@@ -163,11 +160,11 @@ KINDS = {
 }
 
 
-def noise(size: int) -> bytes:
+def noise(size):
     return np.random.default_rng(size).bytes(size)
 
 
-DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+DAMAGES = {
     "empty": lambda content: b"",
     "one byte": lambda content: content[:1],
     "the signature alone": lambda content: content[:8],

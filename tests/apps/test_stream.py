@@ -2,8 +2,6 @@
 software, stacks, folders.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -2,8 +2,6 @@
 paper's figures: their numbers are those of independent measurements and recoveries.
 """
 
-from __future__ import annotations
-
 import csv
 import os
 from pathlib import Path

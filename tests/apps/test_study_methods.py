@@ -2,8 +2,6 @@
 a dictionary of light-field patches.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -27,7 +25,7 @@ from tofclip.light_field import LightField
 
 
 class TestCodedLine:
-    def two_views(self, difference: float) -> LightField:
+    def two_views(self, difference):
         """Two views whose sum is the same whatever their difference: so is what shift-and-add makes
         of them at s = 0.
         """

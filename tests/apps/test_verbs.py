@@ -1,7 +1,5 @@
 """The verbs as the README uses them, on the files of a small instrument."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

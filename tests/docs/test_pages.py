@@ -2,8 +2,6 @@
 and show what their words say.
 """
 
-from __future__ import annotations
-
 import importlib
 import io
 import json

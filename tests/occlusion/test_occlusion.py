@@ -2,8 +2,6 @@
 occluder and target separated by time, and the model of what the one hides of the other.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -46,7 +44,7 @@ from tofclip.simulate.patterns import make_plain_pattern
 from tofclip.units import SPEED_OF_LIGHT
 
 
-def make_plate(width: float, height: float, z: float, x: float = 0.0) -> Body:
+def make_plate(width, height, z, x=0.0):
     return Body(
         Rectangle(width, height), Lambertian(make_plain_pattern(0.5)), np.array([x, 0.0, z])
     )

@@ -1,7 +1,5 @@
 """Several sources in one scene, and how something is looked at in a file."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +18,7 @@ from tofclip.errors import FileFormatError
 
 
 @pytest.fixture
-def paths(tmp_path: Path) -> list[str]:
+def paths(tmp_path):
     """Frames, a cloud and a volume."""
     named = {"frames.h5": frames(), "cloud.ply": plane(40), "volume.h5": volume()}
     for name, one in named.items():
@@ -28,12 +26,12 @@ def paths(tmp_path: Path) -> list[str]:
     return [str(tmp_path / name) for name in named]
 
 
-def open_layers(paths: list[str]) -> tuple[LayeredSource, Session]:
+def open_layers(paths):
     source = LayeredSource([open_source(path) for path in paths])
     return source, Session(source)
 
 
-def test_layers_are_shown_together_each_on_and_off_and_moved_aside(paths: list[str]) -> None:
+def test_layers_are_shown_together_each_on_and_off_and_moved_aside(paths):
     source, session = open_layers(paths)
     whole = session.frame_at(0.0)
     sizes = np.bincount(whole.layers)[1:].tolist()
@@ -56,7 +54,7 @@ def test_layers_are_shown_together_each_on_and_off_and_moved_aside(paths: list[s
     assert {"1 streak", "2 depth", "3 intensity"} - set(source.pictures(0)) == {"2 depth"}
 
 
-def test_layers_with_times_of_their_own_are_shown_at_one_instant() -> None:
+def test_layers_with_times_of_their_own_are_shown_at_one_instant():
     whole, later = TransientSource("whole", frames()), TransientSource("later", frames()[10:])
     for one in (whole, later):
         one.gate.value, one.half_gate.value = GATE_AROUND_FRAME, 5
@@ -65,18 +63,15 @@ def test_layers_with_times_of_their_own_are_shown_at_one_instant() -> None:
     assert np.bincount(session.frame_at(0.0).layers).tolist() == [0, 36, 36]
 
 
-def test_a_pick_reads_the_waveform_of_its_own_layer(paths: list[str]) -> None:
+def test_a_pick_reads_the_waveform_of_its_own_layer(paths):
     _, session = open_layers(paths[1::-1])
     shown = session.frame_at(0.0)
     for layer, has_waveform in ((1, False), (2, True)):
         pick = session.pick((0, 0, 0), shown.cloud.xyz[shown.layers == layer][0])
-        assert pick is not None
         assert (pick.waveform is not None) is has_waveform
 
 
-def test_a_state_brings_back_what_was_seen_also_beside_moved_files(
-    paths: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_state_brings_back_what_was_seen_also_beside_moved_files(paths, tmp_path, capsys):
     source, session = open_layers(paths)
     session.opened = {"sources": paths, "options": {}}
     source.settings[2].value = GATE_AROUND_FRAME

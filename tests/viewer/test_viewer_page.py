@@ -1,16 +1,11 @@
 """The page in a browser: what a user sees, clicks and takes along."""
 
-from __future__ import annotations
-
 import contextlib
 import http.server
 import io
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +15,6 @@ from viewer_scenes import PlaneSource, frames, volume
 
 from apps.viewer.page import Page, serve_waiting
 from apps.viewer.session import Session, read_state
-from apps.viewer.source import Source
 from apps.viewer.sources import (
     GATE_AROUND_FRAME,
     LINEAR_NOTE,
@@ -60,7 +54,7 @@ HARMLESS = ("THREE.Clock", "GPU stall", "GroupMarkerNotSet", "Automatic fallback
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def browser():
     if CHROMIUM is None:
         pytest.skip("there is no chromium here (on Debian: apt-get install chromium)")
     with playwright.sync_playwright() as driver:
@@ -69,7 +63,7 @@ def browser() -> Iterator[Any]:
         opened.close()
 
 
-def until(met: Callable[[], Any], what: str, patience_ms: float = PATIENCE_MS) -> None:
+def until(met, what, patience_ms=PATIENCE_MS):
     """Wait for something to become so."""
     deadline = time.monotonic() + patience_ms / 1e3
     while not met():
@@ -77,7 +71,7 @@ def until(met: Callable[[], Any], what: str, patience_ms: float = PATIENCE_MS) -
         time.sleep(0.05)
 
 
-def succeeds(act: Callable[[], Any]) -> bool:
+def succeeds(act):
     """Say whether something could be done; the page may just have drawn its place anew."""
     try:
         act()
@@ -87,7 +81,7 @@ def succeeds(act: Callable[[], Any]) -> bool:
 
 
 @contextlib.contextmanager
-def serve(source: Source, waiting: Any = None) -> Iterator[Page]:
+def serve(source, waiting=None):
     """A page of a source, while it is served."""
     page = Page(Session(source), waiting=waiting)
     thread = threading.Thread(target=page.run, daemon=True)
@@ -100,7 +94,7 @@ def serve(source: Source, waiting: Any = None) -> Iterator[Page]:
 class Seen:
     """A served page and the tab that looks at it."""
 
-    def __init__(self, browser: Any, page: Page) -> None:
+    def __init__(self, browser, page):
         self.page, self.session, self.complaints = page, page.session, []
         self.tab = browser.new_page(viewport=WINDOW)
         self.tab.set_default_timeout(PATIENCE_MS)
@@ -115,81 +109,81 @@ class Seen:
         until(self.is_framed, "the page has framed the cloud for this window", LOADING_MS)
         until(lambda: self.picture().std() > 0.02, "the scene is drawn", LOADING_MS)
 
-    def _listen(self, line: Any) -> None:
+    def _listen(self, line):
         if line.type in ("error", "warning") and not any(word in line.text for word in HARMLESS):
             self.complaints.append(line.text)
 
-    def row(self, label: str) -> Any:
+    def row(self, label):
         """The control with a label."""
         return self.tab.locator(
             f'xpath=//label[normalize-space()="{label}"]/ancestor::div[contains(@class,"Flex-root")][1]'
         )
 
-    def type(self, label: str, value: str, field: int = -1) -> None:
+    def type(self, label, value, field=-1):
         """Type into a number's box; a slider's is its last one."""
         box = self.row(label).locator("input:not([type=hidden])").nth(field)
         box.fill(value)
         box.press("Tab")
 
-    def choose(self, label: str, option: str) -> None:
+    def choose(self, label, option):
         """Choose from a list."""
         self.row(label).locator("input:not([type=hidden])").first.click()
         self.tab.get_by_role("option", name=option, exact=True).click()
 
-    def press(self, button: str) -> None:
+    def press(self, button):
         self.tab.get_by_role("button", name=button, exact=True).click()
 
-    def tick(self, label: str) -> None:
+    def tick(self, label):
         """Click a box until it has changed: the panel that holds it may still be moving."""
         box = self.row(label).locator("input[type=checkbox]")
         wanted = not box.is_checked()
 
-        def click() -> None:
+        def click():
             if box.is_checked() != wanted:  # an earlier click may have come late
                 box.click(force=True)
             playwright.expect(box).to_be_checked(checked=wanted, timeout=2000)
 
         until(lambda: succeeds(click), f"'{label}' is {'' if wanted else 'un'}ticked")
 
-    def save(self, button: str, path: Path) -> Path:
+    def save(self, button, path):
         """Press a button that has a file downloaded."""
         with self.tab.expect_download() as download:
             self.press(button)
         download.value.save_as(path)
         return path
 
-    def text(self, place: str) -> str:
+    def text(self, place):
         return str(self.tab.locator(place).inner_text())
 
-    def number(self, place: str) -> int:
+    def number(self, place):
         return int(self.text(place))
 
-    def until_number(self, place: str, number: int) -> None:
+    def until_number(self, place, number):
         until(lambda: self.number(place) == number, f"{place} says {number}")
 
-    def until_text(self, place: str, words: str) -> None:
+    def until_text(self, place, words):
         until(lambda: words in self.text(place), f"{place} says '{words}'")
 
-    def until_other(self, before: np.ndarray, difference: float = 0.2) -> None:
+    def until_other(self, before, difference=0.2):
         until(lambda: np.abs(self.picture() - before).max() > difference, "the picture changes")
 
-    def picture(self) -> np.ndarray:
+    def picture(self):
         """What the scene looks like on the page."""
         return imread(io.BytesIO(self.tab.locator(SCENE).screenshot()))[..., :3]
 
-    def find(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    def find(self, xyz):
         """Row and column of points in the picture of the scene, and its shape."""
         canvas = self.tab.locator(SCENE).bounding_box()
         shape = round(canvas["height"]), round(canvas["width"])
         row, column, _ = self.page.viewpoint.project(xyz, shape)
         return row, column, shape
 
-    def place(self, row: float, column: float) -> tuple[float, float]:
+    def place(self, row, column):
         """Where a pixel of the scene lies in the window, from the left and the top."""
         canvas = self.tab.locator(SCENE).bounding_box()
         return canvas["x"] + column, canvas["y"] + row
 
-    def is_framed(self) -> bool:
+    def is_framed(self):
         """Whether the browser looks from where it was sent, every point lies in the free part of the
         window, and the cloud fills much of it.
         """
@@ -211,10 +205,10 @@ class Seen:
         fills = max(np.ptp(row) / shape[0], np.ptp(column) / shape[1]) > 0.6
         return bool(same_view and inside and fills)
 
-    def unfold(self, folder: str, label: str) -> None:
+    def unfold(self, folder, label):
         """Unfold a folder until a control in it is seen: a click on what moves is lost."""
 
-        def click() -> bool:
+        def click():
             if not self.row(label).is_visible():
                 self.tab.get_by_text(folder, exact=True).click()
                 self.tab.wait_for_timeout(1000)
@@ -222,7 +216,7 @@ class Seen:
 
         until(click, f"'{folder}' is unfolded")
 
-    def reset_filters(self) -> bool:
+    def reset_filters(self):
         """Whether all points are shown after the button. A browser reports a drag in pieces, of
         which the last may come after it.
         """
@@ -232,14 +226,14 @@ class Seen:
 
 
 @pytest.fixture(scope="module")
-def seen(browser: Any) -> Iterator[Seen]:
+def seen(browser):
     with serve(TransientSource("frames <b>.h5", frames())) as page:
         opened = Seen(browser, page)
         yield opened
         opened.tab.close()
 
 
-def test_it_loads(seen: Seen) -> None:
+def test_it_loads(seen):
     seen.until_number("#points", 85)
     assert seen.number("#frame-number") == 96
     assert seen.text("#label") == "REPLAY"
@@ -259,7 +253,7 @@ def test_it_loads(seen: Seen) -> None:
 
 
 @pytest.mark.parametrize("size", [(1024, 700), (1280, 800), (1920, 1080)])
-def test_the_cloud_fits_between_the_panels(seen: Seen, size: tuple[int, int]) -> None:
+def test_the_cloud_fits_between_the_panels(seen, size):
     seen.tab.set_viewport_size({"width": size[0], "height": size[1]})
     until(seen.is_framed, "the page has framed the cloud for this window")
     canvas = seen.tab.locator(SCENE).bounding_box()
@@ -270,7 +264,7 @@ def test_the_cloud_fits_between_the_panels(seen: Seen, size: tuple[int, int]) ->
 
 
 @pytest.mark.parametrize("seconds", [2.0, pytest.param(10.0, marks=pytest.mark.nightly)])
-def test_no_control_moves_while_frames_pass(seen: Seen, seconds: float) -> None:
+def test_no_control_moves_while_frames_pass(seen, seconds):
     seen.press("|<")
     seen.choose("speed", "1/2")
     seen.press("play")
@@ -286,7 +280,7 @@ def test_no_control_moves_while_frames_pass(seen: Seen, seconds: float) -> None:
     seen.press(">|")
 
 
-def test_play_pause_and_step(seen: Seen) -> None:
+def test_play_pause_and_step(seen):
     seen.press("play")
     until(lambda: 1 < seen.number("#frame-number") < 96, "the frame advances")
     seen.press("pause")
@@ -301,7 +295,7 @@ def test_play_pause_and_step(seen: Seen) -> None:
     seen.until_number("#points", 85)
 
 
-def test_recolour(seen: Seen) -> None:
+def test_recolour(seen):
     before = seen.picture()
     seen.choose("colour", "intensity")
     seen.until_text("#scale", "intensity (counts)")
@@ -311,14 +305,14 @@ def test_recolour(seen: Seen) -> None:
     seen.until_text("#scale", "range (m)")
 
 
-def test_filter(seen: Seen) -> None:
+def test_filter(seen):
     seen.unfold("filters", "clip box")
     seen.type("keep from, to", "1.6", field=1)  # the squares are at 1.59 m and 1.68 m
     seen.until_number("#points", 36)
     until(seen.reset_filters, "it is back")
 
 
-def test_a_plane_is_fitted_and_a_section_lies_in_it(seen: Seen) -> None:
+def test_a_plane_is_fitted_and_a_section_lies_in_it(seen):
     """The farther square, of 49 points, is a plane but for the noise of its ranges."""
     seen.unfold("section and plane", "section")
     seen.tick("section")
@@ -330,14 +324,14 @@ def test_a_plane_is_fitted_and_a_section_lies_in_it(seen: Seen) -> None:
     until(lambda: seen.number("#points") == 85, "all is shown again")
 
 
-def test_the_clip_box_is_dragged_by_its_corners(seen: Seen) -> None:
+def test_the_clip_box_is_dragged_by_its_corners(seen):
     seen.until_number("#points", 85)
     seen.unfold("filters", "clip box")
     before = seen.picture()
     seen.tick("clip box")
     scene = seen.page.server.scene
     until(lambda: scene.get_handle_by_name("/clip/low") is not None, "there are handles")
-    handle: Any = scene.get_handle_by_name("/clip/low")
+    handle = scene.get_handle_by_name("/clip/low")
     # along the arrow that points right, until a part of the nearer square is outside
     row, column, _ = seen.find(handle.position + np.outer((0.5, 2.5), (handle.scale, 0, 0)))
     there = tuple(slice(round(middle) - 4, round(middle) + 5) for middle in (row[0], column[0]))
@@ -352,11 +346,10 @@ def test_the_clip_box_is_dragged_by_its_corners(seen: Seen) -> None:
     until(lambda: scene.get_handle_by_name("/clip/low") is None, "the handles are gone")
 
 
-def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
+def test_pick_a_point_and_read_its_waveform(seen):
     shown, before = seen.session.latest, seen.picture()
-    assert shown is not None
 
-    def click(points: np.ndarray) -> None:
+    def click(points):
         row, column, _ = seen.find(shown.cloud.xyz[points].mean(axis=0, keepdims=True))
         seen.tab.mouse.click(*seen.place(row[0], column[0]))
 
@@ -365,13 +358,13 @@ def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
     assert "pixel row" in seen.text("#picked")
     plot = seen.tab.locator(".uplot canvas")
 
-    def shows_the_return() -> bool:
+    def shows_the_return():
         if plot.count() != 1:
             return False
         place = plot.bounding_box()
         if place is None or not 0 < place["height"] <= 700 - place["y"]:  # without scrolling
             return False
-        taken: list[bytes] = []
+        taken = []
         if not succeeds(lambda: taken.append(plot.screenshot())):
             return False
         drawn = imread(io.BytesIO(taken[0]))
@@ -386,7 +379,7 @@ def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
     assert np.abs(seen.picture() - before).mean() < 0.05
 
 
-def test_refocus(seen: Seen) -> None:
+def test_refocus(seen):
     seen.choose("time gate", GATE_AROUND_FRAME)
     seen.type("frame", "31")
     seen.until_number("#points", 36)
@@ -395,13 +388,11 @@ def test_refocus(seen: Seen) -> None:
     until(lambda: seen.session.latest is not before, "it is refocused")
     assert seen.session.source.refocus.value == 1.0
     after = seen.session.latest
-    assert before.pixels is not None
-    assert after.pixels is not None
     assert not np.array_equal(after.pixels, before.pixels)
     seen.type("refocus", "0")
     until(lambda: seen.session.source.refocus.value == 0, "it is as it was")
 
-    def measure_panel() -> float:
+    def measure_panel():
         first, last = (seen.row(one).bounding_box() for one in ("frame", "point size"))
         return float(last["y"] - first["y"])
 
@@ -412,7 +403,7 @@ def test_refocus(seen: Seen) -> None:
     seen.choose("method", "l1")
 
 
-def test_screenshot_export_and_bookmark(seen: Seen, tmp_path: Path) -> None:
+def test_screenshot_export_and_bookmark(seen, tmp_path):
     drawn = imread(seen.save("screenshot", tmp_path / "shot.png"))[..., :3]
     assert min(drawn.shape[:2]) > 300
     legend = drawn[-70:]
@@ -432,7 +423,7 @@ def test_screenshot_export_and_bookmark(seen: Seen, tmp_path: Path) -> None:
         seen.choose("view from", preset)
 
 
-def test_k_shows_the_keys_and_nothing_was_complained_about(seen: Seen) -> None:
+def test_k_shows_the_keys_and_nothing_was_complained_about(seen):
     seen.tab.evaluate("document.activeElement.blur()")  # into a box, a K is typed
     seen.tab.keyboard.press("k")
     seen.tab.get_by_text("play or pause").first.wait_for()
@@ -440,7 +431,7 @@ def test_k_shows_the_keys_and_nothing_was_complained_about(seen: Seen) -> None:
     assert seen.complaints == []
 
 
-def test_on_a_phone_the_panel_is_folded_and_the_scene_framed(browser: Any, seen: Seen) -> None:
+def test_on_a_phone_the_panel_is_folded_and_the_scene_framed(browser, seen):
     tab = browser.new_page(viewport={"width": 390, "height": 800})
     tab.goto(seen.page.address)
     tab.locator("#label").wait_for(state="attached", timeout=LOADING_MS)
@@ -452,7 +443,7 @@ def test_on_a_phone_the_panel_is_folded_and_the_scene_framed(browser: Any, seen:
     until(lambda: len(seen.page.server.get_clients()) == 1, "it has gone")
 
 
-def test_a_page_that_waits_becomes_the_page_in_the_same_tab_until_it_ends(browser: Any) -> None:
+def test_a_page_that_waits_becomes_the_page_in_the_same_tab_until_it_ends(browser):
     """A raw shot takes seconds: the browser has loaded by then, and says what it waits for."""
     waiting = serve_waiting("shot.tif", "recovering <b>shot.tif")
     tab = browser.new_page(viewport=WINDOW)
@@ -465,7 +456,7 @@ def test_a_page_that_waits_becomes_the_page_in_the_same_tab_until_it_ends(browse
         assert tab.locator("#waiting").count() == 0
         (client,) = page.server.get_clients().values()
 
-        def is_framed() -> bool:
+        def is_framed():
             camera = client.camera
             there = Viewpoint(camera.position, camera.look_at, camera.fov)
             return page.viewpoint.is_close_to(there)
@@ -480,15 +471,15 @@ def test_a_page_that_waits_becomes_the_page_in_the_same_tab_until_it_ends(browse
 class EmptyPage(http.server.BaseHTTPRequestHandler):
     """A page of another server of this computer."""
 
-    def do_GET(self) -> None:
+    def do_GET(self):
         self.send_response(200)
         self.end_headers()
 
-    def log_message(self, *_: Any) -> None:
+    def log_message(self, *_):
         """Say nothing."""
 
 
-def test_the_pages_of_other_servers_see_nothing(browser: Any) -> None:
+def test_the_pages_of_other_servers_see_nothing(browser):
     """Not even in the browser that has the cookie, which it sends along to every port."""
     with contextlib.ExitStack() as stack:
         page, second = (Page(Session(PlaneSource())) for _ in range(2))
@@ -519,7 +510,7 @@ def test_the_pages_of_other_servers_see_nothing(browser: Any) -> None:
 
 
 @pytest.mark.nightly
-def test_a_volume_as_a_surface(browser: Any) -> None:
+def test_a_volume_as_a_surface(browser):
     with serve(VolumeSource("ball", volume())) as page:
         seen = Seen(browser, page)
         until(lambda: seen.number("#points") > 10, "the maximum projection is shown first")

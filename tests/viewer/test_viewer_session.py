@@ -2,12 +2,9 @@
 often they are drawn: all over values and times that the test sets.
 """
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +44,7 @@ from apps.viewer.viewpoint import (
 from tofclip.errors import InputError
 
 
-def test_frames_follow_the_time_and_the_speed() -> None:
+def test_frames_follow_the_time_and_the_speed():
     clock = PlaybackClock(8.0, lambda: range(100), loop=False)
     clock.play()
     assert [clock.tick(now) for now in (5.0, 5.0625, 5.125, 6.0)] == [0, 0, 1, 8]
@@ -62,7 +59,7 @@ def test_frames_follow_the_time_and_the_speed() -> None:
     assert clock.frame == 0
 
 
-def test_a_loop_runs_through_the_frames_that_are_left_at_their_own_pace() -> None:
+def test_a_loop_runs_through_the_frames_that_are_left_at_their_own_pace():
     """Of a live source the first ones are forgotten: frame 10 of 4 to 9 is 4, and so on."""
     clock = PlaybackClock(10.0, lambda: range(4, 10))
     clock.jump(4)
@@ -73,7 +70,7 @@ def test_a_loop_runs_through_the_frames_that_are_left_at_their_own_pace() -> Non
     assert due == [4 + number % 6 for number in range(15)]
 
 
-def test_steps_and_jumps_stay_among_the_frames_that_are_left() -> None:
+def test_steps_and_jumps_stay_among_the_frames_that_are_left():
     clock = PlaybackClock(10.0, lambda: range(5))
     clock.jump(3)
     clock.play()
@@ -90,19 +87,17 @@ def test_steps_and_jumps_stay_among_the_frames_that_are_left() -> None:
 
 
 @given(st.floats(0, 1e3), st.integers(1, 50), st.lists(st.floats(0, 1e4), min_size=2, max_size=6))
-def test_there_is_no_other_frame_than_those_that_exist(
-    speed: float, count: int, times: list[float]
-) -> None:
+def test_there_is_no_other_frame_than_those_that_exist(speed, count, times):
     clock = PlaybackClock(25.0, lambda: range(count), speed)
     clock.play()
     assert all(0 <= clock.tick(now) < count for now in sorted(times))
 
 
-def test_a_number_that_was_typed_outlives_the_frame_that_is_being_shown() -> None:
+def test_a_number_that_was_typed_outlives_the_frame_that_is_being_shown():
     """viser calls coroutines at once, and functions from a thread of its own, later."""
-    commands: list[Any] = []
-    jumps: list[int] = []
-    told: list[Any] = []
+    commands = []
+    jumps = []
+    told = []
     slider = SimpleNamespace(value=10, on_update=told.append)
     bind_user_input(slider, commands.append, jumps.append)
     asyncio.run(told[0](SimpleNamespace(client=object(), target=slider)))
@@ -113,7 +108,7 @@ def test_a_number_that_was_typed_outlives_the_frame_that_is_being_shown() -> Non
     assert jumps == [10]
 
 
-def test_limits_get_the_outermost_colours_and_the_middle_the_middle_one() -> None:
+def test_limits_get_the_outermost_colours_and_the_middle_the_middle_one():
     cloud = column([0.5, 1.0, 2.0, 3.0, 9.0])
     view = View(cloud)
     scale = make_scale(view, Colouring("range", "grey", (1.0, 3.0)))
@@ -124,7 +119,7 @@ def test_limits_get_the_outermost_colours_and_the_middle_the_middle_one() -> Non
             Colouring(limits=limits)
 
 
-def test_an_equalised_scale_gives_every_colour_equally_many_points() -> None:
+def test_an_equalised_scale_gives_every_colour_equally_many_points():
     cloud = column(np.exp(np.random.default_rng(1).normal(size=20_000)).tolist())
     scale = make_scale(View(cloud), Colouring("range", "grey", equalised=True))
     inside = (cloud.range >= scale.limits[0]) & (cloud.range <= scale.limits[1])
@@ -136,7 +131,7 @@ def test_an_equalised_scale_gives_every_colour_equally_many_points() -> None:
     assert np.all(np.diff(scale.values) >= 0)
 
 
-def test_height_counts_upwards_and_time_is_in_nanoseconds() -> None:
+def test_height_counts_upwards_and_time_is_in_nanoseconds():
     view = View(make_cloud(np.array([[0.0, -0.3, 1.0]])))
     assert QUANTITIES["height"][1](view) == pytest.approx([0.3])
     # There and back at the speed of light: 6.67 ns for each metre.
@@ -145,14 +140,14 @@ def test_height_counts_upwards_and_time_is_in_nanoseconds() -> None:
 
 @pytest.mark.parametrize("quantity", list_quantities(View(column([]))))
 @pytest.mark.parametrize("equalised", [False, True])
-def test_clouds_of_one_value_or_none_have_colours_too(quantity: str, equalised: bool) -> None:
+def test_clouds_of_one_value_or_none_have_colours_too(quantity, equalised):
     for cloud in (column([]), column([2.0, 2.0])):
         scale = make_scale(View(cloud), Colouring(quantity, equalised=equalised))
         assert scale.limits[0] < scale.limits[1]
         assert colour_points(View(cloud), scale).shape == (len(cloud), 3)
 
 
-def test_dim_points_are_darker_where_asked_for() -> None:
+def test_dim_points_are_darker_where_asked_for():
     view = View(make_cloud(np.ones((100, 3)), {"intensity": np.linspace(0, 99, 100)}))
     colouring = Colouring("range", "grey", (0.0, 1.0), shaded=True)
     shaded = colour_points(view, make_scale(view, colouring))[:, 0]
@@ -162,7 +157,7 @@ def test_dim_points_are_darker_where_asked_for() -> None:
     assert colour_points(view, plain).min() == 255
 
 
-def test_filters_keep_what_lies_within_all_limits() -> None:
+def test_filters_keep_what_lies_within_all_limits():
     xyz = np.array([[0.0, 0, 1], [0, 0, 2], [1, 0, 2], [0, 0, 3]])
     cloud = make_cloud(xyz, {"intensity": np.array([1, 2, 3, 4])})
     for filters, kept in (
@@ -180,10 +175,9 @@ def test_filters_keep_what_lies_within_all_limits() -> None:
 
 
 @given(st.integers(0, 399), st.tuples(*[st.floats(-3, 3)] * 2), st.floats(-3, 1))
-def test_a_ray_at_a_point_finds_it(number: int, aside: tuple[float, float], back: float) -> None:
+def test_a_ray_at_a_point_finds_it(number, aside, back):
     cloud, eye = plane(400), np.array([*aside, back])
     found = find_point_on_ray(cloud.xyz, eye, cloud.xyz[number] - eye)
-    assert found is not None
     seen, aimed = cloud.xyz[found] - eye, cloud.xyz[number] - eye
     # Another point may lie within the reach of a click and nearer; it is never further off than
     # that.
@@ -191,7 +185,7 @@ def test_a_ray_at_a_point_finds_it(number: int, aside: tuple[float, float], back
     assert angle < 0.0041
 
 
-def test_the_point_in_front_is_meant_and_a_miss_means_none() -> None:
+def test_the_point_in_front_is_meant_and_a_miss_means_none():
     xyz = column([2.0, 1.0, 3.0]).xyz
     for origin, direction, hit in (
         ((0, 0, 0), (0, 0, 5), 1),
@@ -212,9 +206,7 @@ def test_the_point_in_front_is_meant_and_a_miss_means_none() -> None:
         ((0.0, 61234.0), "counts", ["0", "2.0e4", "4.0e4", "6.0e4"], "x (counts)"),
     ],
 )
-def test_ticks_are_round_numbers_in_a_suitable_unit(
-    limits: tuple[float, float], unit: str, labels: list[str], title: str
-) -> None:
+def test_ticks_are_round_numbers_in_a_suitable_unit(limits, unit, labels, title):
     low, high = limits
     ticks, words = choose_ticks(Scale("x", unit, "grey", np.linspace(low, high, PALETTE_SIZE)))
     assert ([label for _, label in ticks], words) == (labels, title)
@@ -224,7 +216,7 @@ def test_ticks_are_round_numbers_in_a_suitable_unit(
     assert [low + place * (high - low) for place, _ in ticks] == pytest.approx(expected)
 
 
-def test_lengths_and_instants_are_round_and_in_the_unit_that_a_person_would_use() -> None:
+def test_lengths_and_instants_are_round_and_in_the_unit_that_a_person_would_use():
     lengths = (3.86e-6, 0.00042, 0.0314, 1.853)
     assert list(map(format_length, lengths)) == ["3.86 um", "0.42 mm", "31.4 mm", "1.85 m"]
     times = 10.02e-9 + 20e-12 * np.arange(96)
@@ -233,7 +225,7 @@ def test_lengths_and_instants_are_round_and_in_the_unit_that_a_person_would_use(
 
 
 @pytest.mark.parametrize(("longest", "bar"), [(1.0, 1.0), (0.43, 0.2), (0.0199, 0.01), (7.0, 5.0)])
-def test_a_scale_bar_is_one_two_or_five(longest: float, bar: float) -> None:
+def test_a_scale_bar_is_one_two_or_five(longest, bar):
     assert round_length_down(longest) == pytest.approx(bar)
     width = longest / SCALE_BAR_FRACTION
     box = Box(np.zeros(3), np.array([width, 1.0, width]))
@@ -246,14 +238,14 @@ def test_a_scale_bar_is_one_two_or_five(longest: float, bar: float) -> None:
         assert ends.mean(axis=0) == pytest.approx([middle[0], 1 + SCALE_BAR_DROP, middle[2]])
 
 
-def test_right_is_right_and_down_is_down() -> None:
+def test_right_is_right_and_down_is_down():
     ahead = Viewpoint(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.deg2rad(90.0))
     places = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [0, 0, -1]])
     expected = [[50, 50, 75.25, np.nan], [100, 125.25, 100, np.nan], [2, 2, 2, np.nan]]
     np.testing.assert_allclose(ahead.project(places, (101, 201)), expected)
 
 
-def find_inside(xyz: np.ndarray, framed: np.ndarray, aspect: float, floor: float = 1.0) -> Any:
+def find_inside(xyz, framed, aspect, floor=1.0):
     """Which points are in the first picture of a cloud."""
     shape = 600, round(600 * aspect)
     row, column, _ = place_viewpoint(framed, aspect).project(xyz, shape)
@@ -266,9 +258,7 @@ def find_inside(xyz: np.ndarray, framed: np.ndarray, aspect: float, floor: float
     st.floats(0.05, 3),
     st.floats(1.0, 2.0),
 )
-def test_a_cloud_is_seen_whole(
-    middle: tuple[float, float, float], size: float, aspect: float
-) -> None:
+def test_a_cloud_is_seen_whole(middle, size, aspect):
     xyz = (size * np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3)) + middle).astype(np.float32)
     # a hundredth at either end is let go
     assert find_inside(xyz, xyz, aspect).mean() > 0.97
@@ -276,7 +266,7 @@ def test_a_cloud_is_seen_whole(
 
 
 @pytest.mark.parametrize("aspect", [0.6, 1.23])
-def test_an_arm_that_sticks_out_is_in_the_first_picture(aspect: float) -> None:
+def test_an_arm_that_sticks_out_is_in_the_first_picture(aspect):
     """Four points in a thousand lie beside a near square, outside of its box."""
     x, y = np.meshgrid(np.linspace(-0.4, 0.4, 60), np.linspace(-0.3, 0.3, 60))
     arm = np.stack([np.linspace(-0.5, -0.4, 14), np.full(14, 0.3), np.full(14, 0.9)], axis=1)
@@ -286,7 +276,7 @@ def test_an_arm_that_sticks_out_is_in_the_first_picture(aspect: float) -> None:
 
 
 @pytest.mark.parametrize("aspect", [0.6, 0.9, 1.6])
-def test_the_scale_bar_is_in_the_first_picture(aspect: float) -> None:
+def test_the_scale_bar_is_in_the_first_picture(aspect):
     """Also of a deep cloud whose wide part is far away, so that the bar's place is the lowest."""
     random = np.random.default_rng(0)
     far = random.uniform((-0.5, -0.5, 3.0), (0.5, 0.5, 3.01), (400, 3))
@@ -298,7 +288,7 @@ def test_the_scale_bar_is_in_the_first_picture(aspect: float) -> None:
     ).all()
 
 
-def test_panes_have_a_handy_size_and_dark_holes() -> None:
+def test_panes_have_a_handy_size_and_dark_holes():
     scale = Session(PlaneSource()).frame_at(0.0).scale
     for name, image in render_pictures(project_front(plane(4000)), scale).items():
         assert (image.dtype, image.shape) == (np.uint8, (128, 128, 3)), name
@@ -315,7 +305,7 @@ def test_panes_have_a_handy_size_and_dark_holes() -> None:
         assert pane.shape[:2] == sides
 
 
-def test_a_camera_with_few_pixels_leaves_no_seams_in_the_panes() -> None:
+def test_a_camera_with_few_pixels_leaves_no_seams_in_the_panes():
     """A surface of 90 x 90 points in a picture of 128 x 128 pixels, but for a hole in it."""
     x, y = (side.ravel() for side in np.meshgrid(*[np.linspace(-0.5, 0.5, 90)] * 2))
     xyz = np.column_stack([x, y, np.full(x.size, 2.0)])[np.hypot(x, y) > 0.15]
@@ -327,7 +317,7 @@ def test_a_camera_with_few_pixels_leaves_no_seams_in_the_panes() -> None:
     assert (made["intensity"][np.isfinite(made["depth"])] == 1).all()
 
 
-def test_the_slowest_browser_decides_how_many_points_are_drawn() -> None:
+def test_the_slowest_browser_decides_how_many_points_are_drawn():
     detail = DetailChooser()
     assert detail.count(2_000_000, moving=False) == MIN_DRAWN_POINTS  # nothing is known yet
     assert detail.count(100, moving=True) == 100
@@ -340,7 +330,7 @@ def test_the_slowest_browser_decides_how_many_points_are_drawn() -> None:
     assert detail.count(2_000_000, moving=True) == MIN_DRAWN_POINTS
 
 
-def test_a_large_cloud_is_thinned_while_frames_pass() -> None:
+def test_a_large_cloud_is_thinned_while_frames_pass():
     session = Session(PlaneSource(points=4000))
     session.max_playing_points = 500
     assert len(session.frame_at(0.0).cloud) == 4000

@@ -1,12 +1,8 @@
 """Every kind of source, opened by its name and held against what was written."""
 
-from __future__ import annotations
-
 import threading
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +24,7 @@ from viewer_scenes import (
 from apps.viewer.html import render_status_html
 from apps.viewer.session import Session
 from apps.viewer.shots import LiveShots
-from apps.viewer.source import Source, View, make_cloud
+from apps.viewer.source import View, make_cloud
 from apps.viewer.source_factory import FIRST_LOOK_NOTE, ShotOptions, open_source
 from apps.viewer.sources import (
     GATE_ALL_TIMES,
@@ -49,18 +45,17 @@ from apps.viewer.sources import (
 from tofclip.camera import registration
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io.streaks import save_stack
-from tofclip.lidar import PointCloud, depth, point_cloud
+from tofclip.lidar import depth, point_cloud
 from tofclip.recovery import FixedFocus, open_shot, plan_recovery
 from tofclip.sequences import make_pipeline
-from tofclip.sequences.ranger import RangingPipeline, SummedShot
-from tofclip.shots import Streak
+from tofclip.sequences.ranger import RangingPipeline
 
 INSIDE = np.zeros((32, 32), bool)
 INSIDE[NEAR] = INSIDE[FAR] = True
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """What a user may want to look at."""
     place = tmp_path_factory.mktemp("looked_at")
     frames().save(place / "frames.h5")
@@ -76,11 +71,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def transient() -> TransientSource:
+def transient():
     return TransientSource("frames.h5", frames())
 
 
-def wait_until(met: Callable[[], bool]) -> float:
+def wait_until(met):
     """Wait up to 20 s until something is so; return when that was, s."""
     deadline = time.monotonic() + 20
     while not met() and time.monotonic() < deadline:
@@ -88,20 +83,19 @@ def wait_until(met: Callable[[], bool]) -> float:
     return time.monotonic()
 
 
-def show_cloud(session: Session, frame: int) -> PointCloud:
+def show_cloud(session, frame):
     """What is shown of a frame."""
     session.clock.jump(frame)
     return session.frame_at(0.0).cloud
 
 
-def count_close(source: Source, frame: int) -> int:
+def count_close(source, frame):
     """Number of points within a bin of the square whose light comes in a frame."""
     return int(np.sum(np.abs(source.view(0).cloud.range - range_of(frame)) < 3e-3))
 
 
-def test_frames_become_a_cloud_at_the_ranges_of_the_squares(transient: TransientSource) -> None:
+def test_frames_become_a_cloud_at_the_ranges_of_the_squares(transient):
     view = transient.view(0)
-    assert view.pixels is not None
     assert np.all(INSIDE[tuple(view.pixels.T)])
     near = view.pixels[:, 0] < 16
     # The pulse has no noise: a hundredth of a bin of 3 mm.
@@ -109,7 +103,7 @@ def test_frames_become_a_cloud_at_the_ranges_of_the_squares(transient: Transient
     assert np.allclose(view.cloud.range[~near], range_of(FAR_FRAME), atol=3e-5)
 
 
-def test_time_walks_through_a_transient(transient: TransientSource) -> None:
+def test_time_walks_through_a_transient(transient):
     session = Session(transient)
     assert transient.gate.value == GATE_UP_TO_FRAME
     whole = len(session.frame_at(0.0).cloud)
@@ -121,7 +115,6 @@ def test_time_walks_through_a_transient(transient: TransientSource) -> None:
     transient.gate.value = GATE_AROUND_FRAME
     assert len(show_cloud(session, FAR_FRAME)) == 49
     shown = session.frame_at(0.0)
-    assert shown.pixels is not None
     assert len(shown.pixels) == 49
     pictures = session.pictures(shown)
     assert np.unravel_index(pictures["intensity"].argmax(), (32, 32))[0] >= 18
@@ -133,7 +126,7 @@ def test_time_walks_through_a_transient(transient: TransientSource) -> None:
     assert transient.find_gate(2) == range(8)
 
 
-def test_playing_begins_anew_and_ends_at_the_last_frame(transient: TransientSource) -> None:
+def test_playing_begins_anew_and_ends_at_the_last_frame(transient):
     session = Session(transient)
     session.clock.play()
     assert session.frame_at(10.0).frame == 0
@@ -143,13 +136,11 @@ def test_playing_begins_anew_and_ends_at_the_last_frame(transient: TransientSour
     assert session.label == "REPLAY"
 
 
-def test_a_pick_brings_its_pixels_waveform(transient: TransientSource) -> None:
+def test_a_pick_brings_its_pixels_waveform(transient):
     session = Session(transient)
     shown = session.frame_at(0.0).cloud
     far, near = shown.xyz[shown.range.argmax()], shown.xyz[shown.range.argmin()]
     pick = session.pick((0, 0, 0), far)
-    assert pick is not None
-    assert pick.waveform is not None
     times, counts = pick.waveform
     assert times[counts.argmax()] == pytest.approx(pick.point.time[0], abs=BIN_WIDTH)
     assert counts.size == 33  # some pulses on either side
@@ -160,7 +151,7 @@ def test_a_pick_brings_its_pixels_waveform(transient: TransientSource) -> None:
     assert session.picks == []
 
 
-def test_refocusing_moves_the_squares_along_the_slit_and_back(transient: TransientSource) -> None:
+def test_refocusing_moves_the_squares_along_the_slit_and_back(transient):
     """A refocus by one shear of light seen at shear 0 displaces the picture by the camera's own
     figure.
     """
@@ -170,10 +161,9 @@ def test_refocusing_moves_the_squares_along_the_slit_and_back(transient: Transie
     show_cloud(session, NEAR_FRAME - 6)  # not shown for a while
     assert len(session.picks) == 1
 
-    def find_pixels(shear: float) -> tuple[np.ndarray, np.ndarray]:
+    def find_pixels(shear):
         transient.refocus.value = shear
         shown = session.frame_at(0.0)
-        assert shown.pixels is not None
         return shown.pixels, shown.cloud.intensity
 
     (sharp, _), (again, light) = find_pixels(0.0), find_pixels(1e-9)  # recovered once more
@@ -190,9 +180,7 @@ def test_refocusing_moves_the_squares_along_the_slit_and_back(transient: Transie
 
 
 @pytest.mark.parametrize(("method", "shear"), [("tv", 0.5), ("linear", 0.0)])
-def test_points_by_another_method_are_those_that_recover_and_cloud_make(
-    method: str, shear: float
-) -> None:
+def test_points_by_another_method_are_those_that_recover_and_cloud_make(method, shear):
     """They are judged by what this recovery leaves of the shot, not by figures of the frames' own."""
     shot, focus = open_shot(streak()), FixedFocus(shear)
     source = TransientSource("frames.h5", plan_recovery(shot, "wavelet").run())
@@ -204,7 +192,7 @@ def test_points_by_another_method_are_those_that_recover_and_cloud_make(
     np.testing.assert_allclose(shown.false_alarm, point_cloud(expected).false_alarm, atol=1e-6)
 
 
-def test_clouds_follow_one_another(folder: Path) -> None:
+def test_clouds_follow_one_another(folder):
     source = open_source(str(folder / "clouds"))
     session = Session(source)
     assert len(source) == 4
@@ -216,7 +204,7 @@ def test_clouds_follow_one_another(folder: Path) -> None:
     assert source.settings == ()  # there is nothing to refocus
 
 
-def test_a_cloud_of_another_program_needs_positions_only(tmp_path: Path) -> None:
+def test_a_cloud_of_another_program_needs_positions_only(tmp_path):
     (tmp_path / "other.csv").write_text("x,y,z\n0.3,0.4,1.2\nnan,nan,nan\n")
     cloud = open_source(str(tmp_path / "other.csv")).view(0).cloud
     assert cloud.range == pytest.approx([1.3])
@@ -225,24 +213,21 @@ def test_a_cloud_of_another_program_needs_positions_only(tmp_path: Path) -> None
         open_source(str(tmp_path / "flat.csv"))
 
 
-def test_a_single_shot_is_recovered_as_a_transient(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_single_shot_is_recovered_as_a_transient(folder, monkeypatch):
     """Of a camera whose sweep the shot has to tell, the whole search takes longer than the frames."""
     camera().replace(sweep=None).save(folder / "coarse.h5")
-    refined: list[int] = []
+    refined = []
     refine = registration._refine_camera
     monkeypatch.setattr(
         registration, "_refine_camera", lambda *known: refined.append(1) or refine(*known)
     )
     for options, refinements in ((None, 0), (ShotOptions(camera=folder / "coarse.h5"), 2)):
         source = open_source(str(folder / "shot.h5"), options)
-        assert source.times is not None
         assert len(refined) == refinements
         assert min(count_close(source, NEAR_FRAME), count_close(source, FAR_FRAME)) > 25
 
 
-def test_a_quick_look_is_called_one_and_another_method_can_be_asked_for(folder: Path) -> None:
+def test_a_quick_look_is_called_one_and_another_method_can_be_asked_for(folder):
     """A single shot is recovered by iterations; what is linear says so, as does a missing time zero."""
     shot, stack = str(folder / "shot.h5"), str(folder / "stack.h5")
     with_camera = ShotOptions(camera=folder / "camera.h5")
@@ -275,10 +260,9 @@ def test_a_quick_look_is_called_one_and_another_method_can_be_asked_for(folder: 
             open_source(stack, replace(with_camera, method=method))
 
 
-def test_a_single_shot_can_be_looked_at_by_its_surfaces(folder: Path) -> None:
+def test_a_single_shot_can_be_looked_at_by_its_surfaces(folder):
     source = open_source(str(folder / "shot.h5"), ShotOptions(method="surfaces"))
     view = source.view(0)
-    assert view.pixels is not None
     near = view.pixels[:, 0] < 16
     for side, frame in ((near, NEAR_FRAME), (~near, FAR_FRAME)):
         assert side.sum() > 25
@@ -288,7 +272,7 @@ def test_a_single_shot_can_be_looked_at_by_its_surfaces(folder: Path) -> None:
     np.testing.assert_allclose(np.sort(view.cloud.range), expected, rtol=1e-6)
 
 
-def test_a_stack_of_shots_is_recovered_shot_by_shot(folder: Path) -> None:
+def test_a_stack_of_shots_is_recovered_shot_by_shot(folder):
     options = ShotOptions(camera=folder / "camera.h5", time_zero=-20e-9)
     source = open_source(str(folder / "stack.h5"), options)
     assert len(source) == 3
@@ -299,14 +283,12 @@ def test_a_stack_of_shots_is_recovered_shot_by_shot(folder: Path) -> None:
     assert np.sum(np.abs(shown.cloud.range - nearest - 1.498) < 0.02) > 25
     assert set(session.pictures(shown)) == {"streak", "intensity", "depth"}
     pick = session.pick((0, 0, 0), shown.cloud.xyz[0])
-    assert pick is not None
-    assert pick.waveform is not None
     assert pick.waveform.shape[1] < FRAMES / 2  # about its return
     source.refocus.value = 0.5
     assert len(session.frame_at(0.0).cloud) > 0
 
 
-def test_a_volume_as_voxels_surface_projection_and_slices(folder: Path) -> None:
+def test_a_volume_as_voxels_surface_projection_and_slices(folder):
     source = open_source(str(folder / "volume.h5"))
     session, middle = Session(source), [0.05, -0.05, 0.5]
     front = session.frame_at(0.0).cloud.xyz[:, :2].round(3).tolist()
@@ -323,13 +305,12 @@ def test_a_volume_as_voxels_surface_projection_and_slices(folder: Path) -> None:
     assert session.pictures(session.frame_at(0.0))["intensity"].shape == volume().grid.shape[1:]
     source.mode.value, source.threshold.value = SURFACE_MODE, np.exp(-0.5)
     shown = session.frame_at(0.0)
-    assert shown.surface is not None
     radius = np.linalg.norm(shown.surface.vertices - middle, axis=1)
     # one standard deviation, by linear interpolation over 2 cm voxels
     assert np.allclose(radius, 0.04, atol=0.004)
 
 
-def test_what_is_shown_is_called_what_it_is(transient: TransientSource) -> None:
+def test_what_is_shown_is_called_what_it_is(transient):
     """Every slice's projection is not slice 0, and all frames are not the last one."""
     of_volume, of_frames = Session(VolumeSource("ball", volume())), Session(transient)
     assert of_volume.frame_at(0.0).caption == "maximum projection of all 21 slices"
@@ -344,14 +325,14 @@ def test_what_is_shown_is_called_what_it_is(transient: TransientSource) -> None:
     assert PROJECTION_MODE in of_volume.source.mode.options
 
 
-def follow(shots: Iterator[Streak]) -> LiveShots:
+def follow(shots):
     return LiveShots("test", shots, make_pipeline(streak(0)))
 
 
-def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
+def test_live_shots_are_followed_and_can_be_looked_at_again():
     opened = threading.Event()
 
-    def shots() -> Iterator[Streak]:
+    def shots():
         yield streak(0)
         opened.wait(20)
         yield streak(1)
@@ -374,11 +355,11 @@ def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
     source.close()
 
 
-def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_live_shots_that_come_too_fast_are_dropped(monkeypatch):
     opened, busy, came, go_on = (threading.Event() for _ in range(4))
     handed_over = 0.0
 
-    def shots() -> Iterator[Streak]:
+    def shots():
         nonlocal handed_over
         yield streak(0)
         opened.wait(20)
@@ -388,7 +369,7 @@ def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPat
             busy.wait(20)
         came.set()
 
-    def slowly(self: RangingPipeline, shot: Streak) -> SummedShot:
+    def slowly(self, shot):
         if opened.is_set():
             busy.set()
             go_on.wait(20)
@@ -413,7 +394,7 @@ def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPat
     source.close()
 
 
-def test_an_instruments_address() -> None:
+def test_an_instruments_address():
     source = open_source("sim+remoteex://?seed=1&scene=small&frame_rate=20")
     assert source.inflow.is_live
     assert Session(source).label == "LIVE"
@@ -425,7 +406,7 @@ def test_an_instruments_address() -> None:
 
 
 @pytest.mark.parametrize("brightest", [0, 1, 2])
-def test_a_pixels_depth_is_that_of_its_brightest_return(brightest: int) -> None:
+def test_a_pixels_depth_is_that_of_its_brightest_return(brightest):
     """Of a leaf, a branch and a wall in one pixel, whichever sends most light back."""
     xyz = np.array([[0, 0, 2.0], [0, 0, 3.0], [0, 0, 5.0], [0, 0, 4.0]], np.float32)
     light = np.array([10, 20, 15, 1], np.float32)

@@ -1,17 +1,13 @@
 """Pictures, films and the window, and `tofclip view` as users type it."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -44,31 +40,31 @@ ROOT = Path(tofclip.__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cloud(tmp_path_factory):
     path = tmp_path_factory.mktemp("view") / "cloud.ply"
     plane(500).save(path)
     return path
 
 
 @pytest.fixture
-def without_graphics(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_graphics(monkeypatch):
     monkeypatch.setattr(still, "has_working_graphics", lambda: False)
 
 
 class CloudsSource(PlaneSource):
     """One frame, of these points."""
 
-    def __init__(self, xyz: Any) -> None:
+    def __init__(self, xyz):
         super().__init__(1)
         self._xyz = np.asarray(xyz, np.float32)
 
-    def view(self, number: int) -> View:
+    def view(self, number):
         return View(make_cloud(self._xyz, {"intensity": np.ones(len(self._xyz))}))
 
 
-def test_near_points_hide_far_ones_however_many_there_are() -> None:
-    def draw(xyz: Any, colours: Any, *how: Any) -> Any:
-        shown: Any = SimpleNamespace(cloud=SimpleNamespace(xyz=xyz), colours=colours)
+def test_near_points_hide_far_ones_however_many_there_are():
+    def draw(xyz, colours, *how):
+        shown = SimpleNamespace(cloud=SimpleNamespace(xyz=xyz), colours=colours)
         return RasterRenderer().draw(shown, *how)
 
     ahead = Viewpoint(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.deg2rad(90.0))
@@ -86,7 +82,7 @@ def test_near_points_hide_far_ones_however_many_there_are() -> None:
     assert (picture == 200).all(axis=-1).mean() > 0.3
 
 
-def test_points_of_a_picture_touch_however_few_they_are() -> None:
+def test_points_of_a_picture_touch_however_few_they_are():
     """A surface of 41 x 41 points is drawn without seams."""
     x, y = (side.ravel() for side in np.meshgrid(*[np.linspace(-0.5, 0.5, 41)] * 2))
     xyz = np.column_stack([x, y, np.full(x.size, 2.0)]).astype(np.float32)
@@ -102,7 +98,7 @@ def test_points_of_a_picture_touch_however_few_they_are() -> None:
     assert (np.asarray(drawn)[inside].sum(axis=-1) > 120).mean() > 0.97
 
 
-def test_both_renderers_put_points_in_the_same_places() -> None:
+def test_both_renderers_put_points_in_the_same_places():
     if not has_working_graphics():
         pytest.skip("no working graphics library here")
     random = np.random.default_rng(2)
@@ -126,14 +122,12 @@ def test_both_renderers_put_points_in_the_same_places() -> None:
     ("probe", "works"),
     [("", True), ("import os; os.abort()", False), ("raise SystemExit(1)", False)],
 )
-def test_a_graphics_library_that_ends_its_process_is_found_out(probe: str, works: bool) -> None:
+def test_a_graphics_library_that_ends_its_process_is_found_out(probe, works):
     assert has_working_graphics(probe) is works
 
 
 @pytest.mark.usefixtures("without_graphics")
-def test_a_picture_and_its_figures(
-    cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_picture_and_its_figures(cloud, tmp_path, capsys):
     assert main(["view", str(cloud), "--png", str(tmp_path / "cloud.png"), "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert (figures["points"], figures["backend"]) == (500, "matplotlib")
@@ -148,9 +142,9 @@ def test_a_picture_and_its_figures(
         assert title.endswith("drawn by matplotlib: no working graphics library here")
 
 
-def test_a_film_has_all_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_film_has_all_frames(tmp_path, monkeypatch):
     cv2 = pytest.importorskip("cv2", reason="films need OpenCV: pip install 'tofclip[film]'")
-    advanced: list[int] = []
+    advanced = []
     session = Session(PlaneSource(count=4, points=200))
     out = tmp_path / "planes.mp4"
     assert save_film(session, RasterRenderer(), out, advanced.append) == 200
@@ -166,7 +160,7 @@ def test_a_film_has_all_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         save_film(session, RasterRenderer(), out, advanced.append)
 
 
-def test_the_window_follows_its_keys() -> None:
+def test_the_window_follows_its_keys():
     if not has_working_graphics():
         pytest.skip("no working graphics library here")
     import pyvista
@@ -186,9 +180,7 @@ def test_the_window_follows_its_keys() -> None:
 
 
 @pytest.mark.usefixtures("without_graphics")
-def test_a_window_without_a_display_says_what_is_missing(
-    cloud: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_window_without_a_display_says_what_is_missing(cloud, capsys, monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
@@ -199,19 +191,17 @@ def test_a_window_without_a_display_says_what_is_missing(
         open_window(Session(PlaneSource()))
 
 
-def test_the_page_of_a_raw_shot_opens_before_it_is_recovered(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_of_a_raw_shot_opens_before_it_is_recovered(tmp_path, capsys, monkeypatch):
     """What is wrong with the inputs is said without a page; after that, the address comes first."""
     shot = tmp_path / "shot.h5"
     streak().save(shot)
-    order: list[str] = []
+    order = []
     fit = Shot.fit_camera
 
-    def note(name: str, act: Callable[..., Any] = lambda *_, **__: None) -> Callable[..., Any]:
+    def note(name, act=lambda *_, **__: None):
         return lambda *words, **more: order.append(name) or act(*words, **more)
 
-    def refuse(*_: Any, **__: Any) -> None:
+    def refuse(*_, **__):
         raise InputError("no light")
 
     monkeypatch.setattr(Shot, "fit_camera", note("recovered", fit))
@@ -229,9 +219,7 @@ def test_the_page_of_a_raw_shot_opens_before_it_is_recovered(
         urllib.request.urlopen(json.loads(capsys.readouterr().out)["address"])
 
 
-def test_a_page_that_other_computers_reach_is_said_to_be_one(
-    cloud: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_that_other_computers_reach_is_said_to_be_one(cloud, capsys, monkeypatch):
     monkeypatch.setattr(Page, "run", lambda page: None)
     for host, lines in (("127.0.0.1", 0), ("0.0.0.0", 1)):
         assert main(["view", str(cloud), "--no-browser", "--json", "--host", host]) == 0
@@ -241,16 +229,15 @@ def test_a_page_that_other_computers_reach_is_said_to_be_one(
         assert said.err.count("\n") == lines
 
 
-def test_the_page_is_served_without_graphics_display_or_open3d(cloud: Path, tmp_path: Path) -> None:
+def test_the_page_is_served_without_graphics_display_or_open3d(cloud, tmp_path):
     """Libraries that cannot be imported stand for a machine that does not have them."""
     for name in ("open3d", "pyvista", "vtk"):
         (tmp_path / f"{name}.py").write_text("raise ImportError('not on this machine')\n")
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}", "DISPLAY": ""}
     words = [sys.executable, "-m", "tofclip", "view", str(cloud), "--no-browser", "--json"]
-    there: Any = {"cwd": ROOT, "env": environment, "text": True, "stdout": subprocess.PIPE}
+    there = {"cwd": ROOT, "env": environment, "text": True, "stdout": subprocess.PIPE}
     with subprocess.Popen(words, **there) as page:
         try:
-            assert page.stdout is not None
             address = json.loads(page.stdout.readline())["address"]
             with pytest.raises(urllib.error.HTTPError, match="403"):
                 urllib.request.urlopen(address.partition("?")[0])
