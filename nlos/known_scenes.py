@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlos.settings import declare_setting
-from tofclip.arrays import BoolArray, FloatArray
 from tofclip.errors import FileFormatError, InputError, require_positive
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from nlos.capture import Capture, TimeAxis
     from nlos.simulate import HiddenScene, PointScene
     from nlos.volume import Grid, Volume
-    from tofclip.arrays import FloatArray
+    from tofclip.arrays import BoolArray, FloatArray
     from tofclip.storage import Record
 
 SCANS = ("single", "confocal")
