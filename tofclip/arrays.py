@@ -20,7 +20,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from tofclip.errors import InputError, MissingDependencyError
+from tofclip.errors import InputError, MissingDependencyError, explain_import
 
 T = TypeVar("T")
 
@@ -258,12 +258,8 @@ def _find_gpu(library: str, number: int) -> ComputeDevice | None:
 
 
 def _find_torch_device(name: str) -> ComputeDevice:
-    try:
+    with explain_import('PyTorch is not installed; pip install torch, or use `device="cpu"`'):
         import torch
-    except ImportError as problem:
-        raise MissingDependencyError(
-            'PyTorch is not installed; pip install torch, or use `device="cpu"`'
-        ) from problem
     try:
         # Sums are taken in double precision, which some devices do not have. The array knows its
         # device's number.

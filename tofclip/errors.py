@@ -34,7 +34,8 @@ named as in Python, in backquotes (`bin_width`); the command line puts its optio
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from math import inf
 from os import PathLike
 from pathlib import Path
@@ -124,6 +125,15 @@ class BufferOverflowError(DeviceError):
 
 class ProtocolError(DeviceError):
     """The instrument said something that its protocol does not allow."""
+
+
+@contextmanager
+def explain_import(need: str) -> Iterator[None]:
+    """Say what is needed, and how one gets it, where a library does not load within."""
+    try:
+        yield
+    except (ImportError, OSError) as fault:
+        raise MissingDependencyError(f"{need} ({' '.join(str(fault).split())})") from fault
 
 
 def require(holds: object, problem: str) -> None:

@@ -27,9 +27,9 @@ from urllib.parse import unquote
 from tofclip.errors import (
     FileFormatError,
     InputError,
-    MissingDependencyError,
     StorageError,
     TofclipError,
+    explain_import,
     require,
 )
 
@@ -63,12 +63,8 @@ def describe_missing_package(fault: ImportError) -> str | None:
 
 def import_file_reader(name: str, install: str) -> Any:
     """Import a package that reads a kind of file; pip is asked to `install` it."""
-    try:
+    with explain_import(f"this file needs {name}: pip install '{install}'"):
         return importlib.import_module(name)
-    except (ImportError, OSError) as fault:
-        raise MissingDependencyError(
-            f"this file needs {name}: pip install '{install}' ({fault})"
-        ) from fault
 
 
 def import_open3d() -> Any:
@@ -81,12 +77,8 @@ def import_open3d() -> Any:
         ctypes.CDLL(str(libusb), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError):
         pass  # the system may have its own
-    try:
+    with explain_import("Open3D does not load on this machine: pip install open3d"):
         return importlib.import_module("open3d")
-    except (ImportError, OSError) as fault:
-        raise MissingDependencyError(
-            f"Open3D does not load on this machine ({fault}): pip install open3d"
-        ) from fault
 
 
 # Largest array that a file may make of much less: what deflate packs a thousandfold is zeros.

@@ -19,11 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from tofclip.arrays import AnyArray, FloatArray, IntArray
-from tofclip.errors import FileFormatError, MissingDependencyError, StorageError
+from tofclip.errors import FileFormatError, StorageError, explain_import
 from tofclip.files import (
     BoundedFile,
     atomic_path,
-    format_error_line,
     guard,
     require_bounded_size,
     require_suffix,
@@ -47,12 +46,8 @@ Channels = dict[str, AnyArray]
 
 def read_exr_parts(path: Path) -> list[tuple[str, Channels]]:
     """Read name and channels of every part; pixels only if the file can hold them."""
-    try:
+    with explain_import(f"reading {path} needs OpenEXR"):
         import OpenEXR
-    except ImportError as fault:
-        raise MissingDependencyError(
-            f"reading {path} needs OpenEXR: {format_error_line(fault)}"
-        ) from fault
     claimed, count = 0, 0
     with guard(path, "is a truncated or damaged EXR file"):
         held = os.path.getsize(path)

@@ -26,9 +26,9 @@ from typing import TYPE_CHECKING, Any
 from tofclip.errors import (
     FileFormatError,
     InputError,
-    MissingDependencyError,
     StorageError,
     TofclipError,
+    explain_import,
 )
 from tofclip.files import (
     atomic_path,
@@ -131,12 +131,8 @@ def connect_workers(where: str) -> Iterator[Client]:
     version of this program and see the files under the same names.
     """
     number = count_local_workers(where)
-    try:
+    with explain_import("a cluster needs dask.distributed: pip install 'tofclip[cluster]'"):
         import distributed
-    except ImportError as fault:
-        raise MissingDependencyError(
-            "a cluster needs dask.distributed: pip install 'tofclip[cluster]'"
-        ) from fault
     # What matters is in the summary: the library's log stays off the screen.
     logger = logging.getLogger("distributed")
     level = logger.level

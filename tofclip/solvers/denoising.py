@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 from tofclip.arrays import AnyArray, Array, require_numpy
-from tofclip.errors import MissingDependencyError, require, require_shape
+from tofclip.errors import explain_import, require, require_shape
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm, DataTermMaker, Mask
 from tofclip.solvers.fista import ProximalMethod, TotalVariation
@@ -62,13 +62,11 @@ class BlockMatching:
 
     def __call__(self, noisy: Picture, pilot: Picture, deviation: float) -> Picture:
         """Return the picture without its noise, see `Denoiser`; the pilot is not needed."""
-        try:
+        with explain_import(
+            "BM3D needs the package bm3d (free for non-commercial use only): pip install 'tofclip[bm3d]'; "
+            "without it take the denoiser 'collaborative'"
+        ):
             from bm3d import bm3d
-        except ImportError as fault:
-            raise MissingDependencyError(
-                "BM3D needs the package bm3d (free for non-commercial use only): pip install 'tofclip[bm3d]'; "
-                "without it take the denoiser 'collaborative'"
-            ) from fault
         clean: Picture = np.asarray(bm3d(noisy, deviation), noisy.dtype)
         return clean
 
