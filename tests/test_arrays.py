@@ -32,7 +32,7 @@ from tofclip.arrays import (
 )
 from tofclip.camera import Camera
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
-from tofclip.lidar import Detection, depth, pulse_tables
+from tofclip.lidar import Detection, depth
 from tofclip.operators import (
     BlockDiagonal,
     Diagonal,
@@ -293,7 +293,7 @@ class TestOtherDevice:
         found = relative_residual(PROJECTION, frames, *there)
         assert found == pytest.approx(residual, rel=1e-4)
 
-    def test_the_search_for_returns(self, monkeypatch):
+    def test_the_search_for_returns(self):
         """Frames are fetched on purpose, and the same returns found."""
         random = np.random.default_rng(2)
         times = 10e-9 + 20e-12 * np.arange(90)
@@ -305,7 +305,6 @@ class TestOtherDevice:
         detection = Detection(min_scene_fraction=0, min_time_bin_fraction=0)
         expected = depth(frames, detection=detection)
         assert len(expected) > 108
-        monkeypatch.setattr(pulse_tables, "to_numpy", brought_here)
         there = replace(frames, values=OTHER_DEVICE.put(frames.values))
         found = depth(there, detection=detection)
         np.testing.assert_array_equal([found.y, found.x], [expected.y, expected.x])
