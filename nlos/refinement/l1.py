@@ -24,8 +24,8 @@ from nlos.method import (
 from nlos.phasor.arrays import ArrayLibrary
 from nlos.phasor.depth_steps import DiffractionPlan
 from nlos.phasor.plan import Hybrid, WavePlan, find_distance, plan_waves
+from nlos.phasor.propagate import sum_spherical_waves
 from nlos.phasor.to_depths import PortableDiffraction
-from nlos.phasor.wall_to_plane_compiled import sum_spherical_waves
 from nlos.plane import axis_step
 from nlos.volume import Grid, Volume
 from tofclip.arrays import AnyArray, FloatArray

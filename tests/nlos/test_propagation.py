@@ -24,13 +24,13 @@ from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
 from nlos.illumination import build_waves, group_by_illumination
 from nlos.phasor import wall_to_plane
-from nlos.phasor.transfer import Offsets, SphericalWaves, find_min_periods
-from nlos.phasor.wall_to_plane import WallBeforePlane, plan_transforms
-from nlos.phasor.wall_to_plane_compiled import (
+from nlos.phasor.propagate import (
     estimate_strength,
     propagate_direct,
     propagate_low_rank,
 )
+from nlos.phasor.transfer import Offsets, SphericalWaves, find_min_periods
+from nlos.phasor.wall_to_plane import WallBeforePlane, plan_transforms
 from nlos.plane import Plane, VirtualPlane
 
 PULSE = VirtualPulse(0.25, 4.24)
