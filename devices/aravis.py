@@ -31,6 +31,7 @@ from tofclip.errors import (
     MissingDependencyError,
     ProtocolError,
 )
+from tofclip.units import NANOSECOND, PICOSECOND
 
 PIXEL_BITS = {"Mono8": 8, "Mono10": 16, "Mono12": 16, "Mono14": 16, "Mono16": 16}
 FRAME_ID_RANGE = 0xFFFF  # GigE Vision's 16-bit identifiers go from 1 to this, and then to 1 again
@@ -40,7 +41,6 @@ HELD_BYTES, HELD_FRAMES = 64 << 20, (16, 256)
 SOCKET_BUFFER_BYTES = 16 << 20
 PACKET_HEADER_BYTES = 36  # Of IP, UDP and GVSP, in each packet
 SYSTEM_PACKAGES = ("/usr/lib/python3/dist-packages",)
-NANOSECOND_S, PICOSECOND_S = 1e-9, 1e-12
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class AravisFeed(FrameFeed):
             )
         self.calibration = options.gate_record
         if options.row_ps is not None and not options.is_gated:
-            times = (np.arange(height) + 0.5) * options.row_ps * PICOSECOND_S
+            times = (np.arange(height) + 0.5) * options.row_ps * PICOSECOND
             self.calibration = make_streak_calibration(times)
 
     def start(self) -> None:
@@ -215,7 +215,7 @@ class AravisFeed(FrameFeed):
             return None
         if not self._count_missing(frame_id):
             return None
-        stamp = buffer.get_timestamp() * NANOSECOND_S
+        stamp = buffer.get_timestamp() * NANOSECOND
         self._number += 1
         if status != known.SUCCESS:
             self.ledger.truncate()

@@ -41,6 +41,7 @@ from tofclip.io.tcspc import (
     require_pulses,
 )
 from tofclip.storage import Record, Scalar
+from tofclip.units import PICOSECOND
 
 HISTOGRAM_BYTES = 4  # Of one bin in a PHU file
 
@@ -54,7 +55,6 @@ MAX_BINS = 1 << 20
 SWABIAN_CHUNK_TAGS = 1 << 20
 # Types of Swabian Instruments' events: a time tag, and a number of tags that were lost
 SWABIAN_TAG, SWABIAN_MISSED = 0, 4
-PICOSECOND_S = 1e-12
 
 
 class RecordFile(Source):
@@ -193,8 +193,8 @@ class SwabianPhotons:
             )
         self._inputs = sorted(inputs)
         self._rewind()
-        period = count.period_ticks * PICOSECOND_S
-        self.calibration = _describe_bins(PICOSECOND_S, max(1, len(inputs)), period, path)
+        period = count.period_ticks * PICOSECOND
+        self.calibration = _describe_bins(PICOSECOND, max(1, len(inputs)), period, path)
         named = {"inputs": ",".join(map(str, self._inputs))}
         details = {**self.calibration.attributes, **named}
         self.info = Info("time tags (Swabian Instruments)", "", details)

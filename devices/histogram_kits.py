@@ -41,13 +41,14 @@ from tofclip.errors import (
     MissingDependencyError,
 )
 from tofclip.storage import Field, Record
+from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
 
 MAX_LINE_BYTES = 1 << 13
 TMF_BINS, TMF_CHANNELS, TMF_LANES = 128, 10, 30
 TMF_CAPTURES, TMF_NUMBERS = 4, 256
 TMF_TICK_S = 2e-7  # s; the sensor's clock of 5 MHz
 TMF_ZONES = (64, 9)
-VL53_NATIVE_BIN_S = 2 * 37.5348e-3 / 299_792_458  # s; of the 37.5348 mm that ST gives for a bin
+VL53_NATIVE_BIN_S = 2 * 37.5348e-3 / SPEED_OF_LIGHT  # s; of the 37.5348 mm that ST gives for a bin
 
 VL53_SCALE = 10  # Counts are sent with one digit after the point
 
@@ -177,7 +178,6 @@ def _parse_integers(words: list[bytes], count: int) -> list[int]:
 
 
 READ_BYTES = 1 << 16
-PICOSECOND_S = 1e-12
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ class Tmf8828Options(LiveOptions):
     @property
     def bin_width(self) -> float:
         """Duration of a bin, s."""
-        return self.bin_ps * PICOSECOND_S
+        return self.bin_ps * PICOSECOND
 
 
 @dataclass(frozen=True)

@@ -58,10 +58,10 @@ from tofclip.lidar import Pulse
 from tofclip.lidar.photons import PhotonCube
 from tofclip.shots import Streak
 from tofclip.storage import Record, collect_provenance
+from tofclip.units import PICOSECOND
 
 BIN_WIDTH_S = 20e-12  # Width of a histogram's bins where no other is given, s
 READING_S = 10.0  # Of a single shot where the address does not say how long, s
-PICOSECOND_S = 1e-12
 MAX_CUBE_BYTES = 1 << 32
 # Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s
 EDGE_S = 1e-10
@@ -124,8 +124,8 @@ class Accumulation(Options):
     def axis(self, known_period: float | None) -> BinAxis:
         """Return the bins of a histogram of photons."""
         width = BIN_WIDTH_S if self.bin_width is None else self.bin_width
-        start = self.start_ps * PICOSECOND_S
-        period = self.period_ps * PICOSECOND_S if self.period_ps else known_period
+        start = self.start_ps * PICOSECOND
+        period = self.period_ps * PICOSECOND if self.period_ps else known_period
         if self.bins is not None:
             return BinAxis(width, self.bins, start, period)
         if period is None:

@@ -16,7 +16,7 @@ from nlos.volume import Volume
 from tofclip.arrays import AnyArray, FloatArray
 from tofclip.files import PICTURE_SUFFIXES, atomic_path, require_suffix
 from tofclip.notebook import letter_panels, save_figure
-from tofclip.units import MILLIMETRE
+from tofclip.units import MILLIMETRE, NANOSECOND
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -148,7 +148,6 @@ def _find_edges(axis: FloatArray) -> tuple[float, float]:
 FIGURE_SIZE_INCHES = (5.6, 5.0)
 FILM_DOTS_PER_INCH = 80
 FRAME_DURATION_MS, LAST_FRAME_DURATION_MS = 80, 1000
-NANOSECOND = 1e-9
 
 
 def save_film(video: TransientVideo, path: str | Path) -> None:

@@ -26,7 +26,7 @@ import numpy as np
 
 from nlos.capture import Capture
 from nlos.io import labs
-from nlos.io.arrays import NamedArrays, read_hdf5, read_matlab
+from nlos.io.labs import NamedArrays, read_hdf5, read_matlab
 from tofclip.arrays import Float32Array, FloatArray
 from tofclip.errors import FileFormatError
 from tofclip.files import read_toml
@@ -110,16 +110,15 @@ def read_capture(path: str | Path) -> Capture:
     InputError
         What it holds is not a usable capture.
     """
-    capture = read_streak_folder(path) if Path(path).is_dir() else _read_file(path)
+    kinds = "a capture of a known format (HDF5, .npz, .mat, or a folder of EXR files)"
+    capture: Capture = (
+        read_streak_folder(path)
+        if Path(path).is_dir()
+        else read_by_signature(READERS, path, lambda one: one.read(Path(path)), kinds)
+    )
     if capture.provenance:
         return capture
     return replace(capture, provenance=collect_provenance({"verb": "read_capture"}, path))
-
-
-def _read_file(path: str | Path) -> Capture:
-    kinds = "a capture of a known format (HDF5, .npz, .mat, or a folder of EXR files)"
-    found: Capture = read_by_signature(READERS, path, lambda one: one.read(Path(path)), kinds)
-    return found
 
 
 def _read_archive(path: Path) -> Capture:

@@ -1,5 +1,6 @@
-"""Captures of other laboratories' formats, each by its own reader, turned so that the hidden scene
-lies at larger z.
+"""Captures of other laboratories' formats: named arrays of their files, taken out with the same checks
+as those of NumPy archives, and of each format a reader, which turns it so that the hidden scene lies
+at larger z.
 
 Field names, units and the order of axes of y-tal's own files, of the Zaragoza data set and of the
 two of Wisconsin are those of y-tal 0.20 (``tal/io`` of https://github.com/diegoroyo/tal); of other
@@ -13,17 +14,122 @@ import operator
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from nlos.capture import Capture, remove_device_legs
-from nlos.io.arrays import NamedArrays, read_matlab
 from nlos.kernels import rebin, shift_signals
 from tofclip.arrays import AnyArray, Float32Array, FloatArray
 from tofclip.errors import FileFormatError, InputError
-from tofclip.files import translate_read_errors
+from tofclip.files import require_bounded_dataset, translate_read_errors
+from tofclip.io.archive import Archive, ArchiveEntry, Entries, list_mat_entries
+from tofclip.storage import HDF5_SIGNATURE
 from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
+
+# Of a v7.3 file, before the HDF5 data begin.
+MATLAB_HEADER_BYTES = 512
+
+
+class NamedArrays(Archive):
+    """Named arrays of a file in the orders and units that captures come in."""
+
+    def fault(self, problem: str) -> FileFormatError:
+        """What is wrong with the file."""
+        return FileFormatError(self.path, problem)
+
+    def read_numbers(self, name: str) -> AnyArray:
+        """Return entry `name`, numbers of any shape but an empty one."""
+        return self.array(name, *[None] * self._count_axes(name))
+
+    def read_time_last(self, name: str) -> AnyArray:
+        """Return signals (rows, columns, t); refuse rows and columns, two equal axes, after time."""
+        signal = self.array(name, None, None, None)
+        if signal.shape[1] == signal.shape[2] < signal.shape[0]:
+            raise self.fault(
+                f"{name} of shape {signal.shape} begins with time; put time last: "
+                f"permute({name}, [2 3 1])"
+            )
+        return signal
+
+    def read_coordinates(self, name: str, first: bool = False) -> FloatArray:
+        """Return entry `name`, coordinates (..., 3), or (3, ...) where they come `first`, as (..., 3);
+        NaN is allowed.
+        """
+        others = [None] * (self._count_axes(name) - 1)
+        if first:
+            return np.moveaxis(self.array(name, 3, *others), 0, -1).astype(np.float64)
+        return self.array(name, *others, 3).astype(np.float64)
+
+    def number(self, name: str, absent: float | None = None) -> float:
+        """Return a single finite number, whatever its axes of length 1; `absent` without it."""
+        if absent is not None and name not in self:
+            return absent
+        return float(self.finite_array(name, *[1] * self._count_axes(name)).squeeze())
+
+    def flag(self, name: str) -> bool:
+        """Whether entry `name` is there and true."""
+        return name in self and bool(np.all(self.read(name)))
+
+    def _count_axes(self, name: str) -> int:
+        return len(self.describe(name).shape)
+
+
+def read_hdf5(path: str | Path) -> NamedArrays:
+    """List all arrays of an HDF5 file; groups become names with dots."""
+    return NamedArrays(path, partial(_list_hdf5_entries, matlab=False))
+
+
+def read_matlab(path: str | Path) -> NamedArrays:
+    """List the numeric variables of a .mat file, version 5 to 7.3, structs by dotted names, in
+    MATLAB's order of axes, without those of length 1.
+    """
+    with translate_read_errors(path), open(path, "rb") as file:
+        start = file.read(MATLAB_HEADER_BYTES + len(HDF5_SIGNATURE))
+    if start[MATLAB_HEADER_BYTES:] == HDF5_SIGNATURE:
+        return NamedArrays(path, partial(_list_hdf5_entries, matlab=True))
+    return NamedArrays(path, _list_mat_entries)
+
+
+def _list_hdf5_entries(path: Path, matlab: bool) -> Entries:
+    import h5py
+
+    entries: dict[str, ArchiveEntry] = {}
+
+    def note(name: str, item: Any) -> None:
+        if not isinstance(item, h5py.Dataset) or name.startswith("#refs#"):
+            return
+        if item.shape is None or item.dtype.kind not in "uifbSO":
+            return
+        # Texts of variable length, references and MATLAB's cells are no numbers: never read.
+        if not item.dtype.hasobject:
+            require_bounded_dataset(item, path)
+        shape = tuple(n for n in item.shape[::-1] if n != 1) if matlab else item.shape
+        entry = ArchiveEntry(shape, item.dtype, partial(_load_hdf5, path, name, matlab))
+        entries[name.replace("/", ".")] = entry
+
+    with h5py.File(path, "r") as file:
+        file.visititems(note)  # which follows no links
+    return entries
+
+
+def _load_hdf5(path: Path, name: str, matlab: bool) -> AnyArray:
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        values = np.asarray(file[name][()])
+    return np.squeeze(values.T) if matlab else values
+
+
+def _list_mat_entries(path: Path) -> Entries:
+    def squeeze(entry: ArchiveEntry) -> ArchiveEntry:
+        shape = tuple(n for n in entry.shape if n != 1)
+        return ArchiveEntry(shape, entry.dtype, lambda: np.squeeze(entry.load()))
+
+    return {name: squeeze(entry) for name, entry in list_mat_entries(path).items()}
+
 
 # Cosine beyond which a direction counts as z.
 MIN_Z_COSINE = 1 - 1e-6
@@ -429,7 +535,7 @@ def read_zaragoza(fields: NamedArrays) -> Capture:
     first = fields.read_numbers("cameraGridPositions").shape[0] == 3
     signal = _add_up_bounces(fields, first)
     camera, laser = (
-        _read_point_grid(fields, f"{name}GridPositions", first) for name in ("camera", "laser")
+        fields.read_coordinates(f"{name}GridPositions", first) for name in ("camera", "laser")
     )
     bin_width, start = fields.number("deltaT") / SPEED_OF_LIGHT, fields.number("t0", 0.0)
     capture = match_lasers_to_sensors(fields, signal, camera, laser, bin_width, start)
@@ -440,7 +546,8 @@ def read_zaragoza(fields: NamedArrays) -> Capture:
     capture = remove_device_legs(capture, source, eye)
     if "cameraGridNormals" not in fields:
         return capture
-    normal = _read_point_grid(fields, "cameraGridNormals", first).reshape(-1, 3).mean(axis=0)
+    normals = fields.read_coordinates("cameraGridNormals", first)
+    normal = normals.reshape(-1, 3).mean(axis=0)
     if "hiddenVolumePosition" in fields:
         hidden = fields.read_numbers("hiddenVolumePosition").reshape(3)
         hidden = hidden - camera.reshape(-1, 3).mean(axis=0)
@@ -463,13 +570,3 @@ def _add_up_bounces(fields: NamedArrays, first: bool) -> Float32Array:
         signal = np.moveaxis(data.sum(axis=(-1, -3), dtype=np.float32), -1, 0)
     lone = signal.ndim == 1 + 4 and signal.shape[1:3] == (1, 1)
     return np.ascontiguousarray(signal[:, 0, 0] if lone else signal)
-
-
-def _read_point_grid(fields: NamedArrays, name: str, first: bool) -> FloatArray:
-    grid = fields.read_numbers(name).astype(np.float64)
-    grid = np.moveaxis(grid, 0, -1) if first else grid
-    if grid.shape[-1] != 3:
-        raise fields.fault(
-            f"field '{name}' must hold points in three dimensions, found {grid.shape}"
-        )
-    return grid
