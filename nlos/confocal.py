@@ -212,24 +212,16 @@ class LightCone(Method):
 
     def _compute(self, scan: ConfocalScan, grid: Grid) -> Float32Array:
         """Return the image (z, y, x) of a scan on a grid."""
-        from scipy.fft import dctn, ifft2, irfft
+        from scipy.fft import dctn
 
-        bins, workers = scan.signal.shape[2], thread_count()
-        # one sample of u = z^2 for each bin, over the same range of depths
-        squares = bins * scan.spacing**2
-        spectrum, shape = transform_squared_distances(scan, squares, self.falloff)
+        spectrum, squares, shape = transform_squared_distances(scan, self.falloff)
         # along x and y the kernel is even: cosine transforms of a quadrant suffice
         sides = zip(scan.plane.steps, shape[:2], strict=True)
         y, x = (length * np.arange(n // 2 + 1) for length, n in sides)
         columns = transform_paraboloid(y, x, squares, shape, slice(0, spectrum.shape[2]))
-        kernel = dctn(columns.astype(np.complex64), 1, axes=(0, 1), workers=workers)
+        kernel = dctn(columns.astype(np.complex64), 1, axes=(0, 1), workers=thread_count())
         apply_wiener_filter(spectrum, kernel, self.signal_to_noise)
-        spectrum = ifft2(spectrum, axes=(0, 1), workers=workers, overwrite_x=True)
-        values = irfft(spectrum, shape[2], workers=workers, overwrite_x=True)[..., :bins]
-        depth_position = (grid.z - scan.plane.z) ** 2 / squares - 0.5
-        # Depths between the wall and the first sample read the first.
-        image = resample_to_grid(values, scan, grid, np.clip(depth_position, 0, bins - 1))
-        return np.maximum(image, 0)
+        return np.maximum(image_squared_depths(spectrum, scan, grid, squares, shape[2]), 0)
 
 
 def apply_wiener_filter(
@@ -248,14 +240,16 @@ def apply_wiener_filter(
 
 
 def transform_squared_distances(
-    scan: ConfocalScan, squares: float, falloff: float
-) -> tuple[ComplexArray, tuple[int, int, int]]:
+    scan: ConfocalScan, falloff: float
+) -> tuple[ComplexArray, float, tuple[int, int, int]]:
     """Return the half spectrum (y, x, v) of the signals over the square v of the distance, times
-    d^falloff, padded, and its samples with the padding; `squares`: from sample to sample of v, m^2.
+    d^falloff, padded; from sample to sample of v, and of u = z^2, m^2; and its samples with the padding.
     """
     from scipy.fft import fft2, rfft
 
     rows, columns, bins = scan.signal.shape
+    # one sample of u = z^2 for each bin, over the same range of depths
+    squares = bins * scan.spacing**2
     shape = (find_padded_length(rows), find_padded_length(columns), find_padded_length(bins))
     # edges of the bins in v; a bin is centred on its distance
     edges = (np.clip(np.arange(bins + 1) - 0.5, 0, None) * scan.spacing) ** 2
@@ -264,7 +258,23 @@ def transform_squared_distances(
     over_squares = rebin(light, edges, squares * np.arange(bins + 1))
     workers = thread_count()
     spectrum = rfft(over_squares, shape[2], workers=workers)
-    return fft2(spectrum, shape[:2], axes=(0, 1), workers=workers), shape
+    return fft2(spectrum, shape[:2], axes=(0, 1), workers=workers), squares, shape
+
+
+def image_squared_depths(
+    spectrum: ComplexArray, scan: ConfocalScan, grid: Grid, squares: float, samples: int
+) -> Float32Array:
+    """Return voxels (z, y, x) of a half spectrum (y, x, u) over the square of the depth, which it
+    overwrites.
+    """
+    from scipy.fft import ifft2, irfft
+
+    bins, workers = scan.signal.shape[2], thread_count()
+    spectrum = ifft2(spectrum, axes=(0, 1), workers=workers, overwrite_x=True)
+    values = irfft(spectrum, samples, workers=workers, overwrite_x=True)[..., :bins]
+    position = (grid.z - scan.plane.z) ** 2 / squares - 0.5
+    # Depths between the wall and the first sample read the first.
+    return resample_to_grid(values, scan, grid, np.clip(position, 0, bins - 1))
 
 
 def transform_paraboloid(

@@ -14,7 +14,7 @@ from nlos.capture import Capture
 from nlos.confocal import (
     ConfocalScan,
     LightCone,
-    resample_to_grid,
+    image_squared_depths,
     transform_paraboloid,
     transform_squared_distances,
 )
@@ -30,7 +30,7 @@ from tofclip.arrays import (
     FloatArray,
 )
 from tofclip.errors import InputError
-from tofclip.threads import run_blocks, thread_count
+from tofclip.threads import run_blocks
 
 # Standard deviation of the neighbourhood whose gradients give a normal, voxels.
 GRADIENT_VOXELS = 2.0
@@ -186,21 +186,13 @@ class DirectionalLightCone:
 
     def _deconvolve(self, scan: ConfocalScan, grid: Grid) -> Float32Array:
         """Return albedo times normal, (3, z, y, x)."""
-        from scipy.fft import ifft2, irfft
-
-        bins, workers = scan.signal.shape[2], thread_count()
-        squares = bins * scan.spacing**2
         # By one power more than the transform without directions.
         falloff = self.transform.falloff + 1
-        spectrum, shape = transform_squared_distances(scan, squares, falloff)
-        unit = float(grid.z.mean() - scan.plane.z)
+        spectrum, squares, shape = transform_squared_distances(scan, falloff)
+        unit, depth = float(grid.z.mean() - scan.plane.z), grid.z - scan.plane.z
         parts = _separate(spectrum, scan, squares, shape, unit, 1 / self.transform.signal_to_noise)
-        depth = grid.z - scan.plane.z
-        position = np.clip(depth**2 / squares - 0.5, 0, bins - 1)
-        vectors = np.empty((3, *grid.shape), np.float32)
-        for number, part in enumerate(parts):
-            image = irfft(ifft2(part, axes=(0, 1), workers=workers), shape[2], workers=workers)
-            vectors[number] = resample_to_grid(image[..., :bins], scan, grid, position)
+        images = [image_squared_depths(part, scan, grid, squares, shape[2]) for part in parts]
+        vectors = np.stack(images)
         vectors[2] *= (-unit / np.maximum(depth, scan.spacing))[:, np.newaxis, np.newaxis]
         return vectors
 

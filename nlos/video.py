@@ -31,7 +31,7 @@ from nlos.phasor.arrays import ArrayLibrary
 from nlos.phasor.plan import Hybrid, PlanarRSD, plan_groups, require_even_grid
 from nlos.phasor.propagate import Backend
 from nlos.phasor.to_depths import DepthPropagator
-from nlos.volume import AXES, Grid, Volume
+from nlos.volume import AXES, Grid, Volume, load_axes, store_axes
 from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
@@ -125,19 +125,21 @@ class TransientVideo:
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
-        axes = {name: Field(getattr(self.grid, name), "m", (name,)) for name in AXES}
         values = Field(self.values, "", ("time", *AXES[-self.values.ndim + 1 :]))
-        fields = {"values": values, "time": Field(self.times, "s", ("time",)), **axes}
+        fields = {
+            "values": values,
+            "time": Field(self.times, "s", ("time",)),
+            **store_axes(self.grid),
+        }
         return Record("transient video", fields, provenance=self.provenance)
 
     @classmethod
     def from_record(cls, record: Record) -> TransientVideo:
         """Rebuild a video from its ``record``."""
         dimensions = record.fields["values"].values.ndim if "values" in record.fields else 4
-        x, y, z = (record.array(name, np.float64, 1, "m") for name in "xyz")
         values = record.array("values", np.float32, dimensions)
         times = record.array("time", np.float64, 1, "s")
-        return cls(values, times, Grid(x, y, z), record.provenance)
+        return cls(values, times, load_axes(record), record.provenance)
 
     def save(self, path: str | Path) -> None:
         """Write the video to an HDF5 file ``path``, whole or not at all."""

@@ -191,6 +191,16 @@ def _fill_axis(name: str, side: Sequence[float], voxel: float) -> FloatArray:
 AXES = ("z", "y", "x")
 
 
+def store_axes(grid: Grid) -> dict[str, Field]:
+    """Return the fields of a record that hold a grid."""
+    return {name: Field(getattr(grid, name), "m", (name,)) for name in AXES}
+
+
+def load_axes(record: Record) -> Grid:
+    """Return the grid that a ``record`` holds."""
+    return Grid(*(record.array(name, np.float64, 1, "m") for name in "xyz"))
+
+
 @dataclass(frozen=True, eq=False)
 class Projection:
     """The brightest voxel along every line of sight in z.
@@ -366,8 +376,7 @@ class Volume:
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
-        axes = {name: Field(getattr(self.grid, name), "m", (name,)) for name in AXES}
-        fields = {"values": Field(to_numpy(self.values), "", AXES), **axes}
+        fields = {"values": Field(to_numpy(self.values), "", AXES), **store_axes(self.grid)}
         return Record("volume", fields, provenance=self.provenance)
 
     @classmethod
@@ -376,8 +385,7 @@ class Volume:
         field = record.fields.get("values")
         kept = field is not None and field.values.dtype.kind in "fc"
         values = record.array("values", field.values.dtype if field and kept else np.float32, 3)
-        x, y, z = (record.array(name, np.float64, 1, "m") for name in "xyz")
-        return cls(values, Grid(x, y, z), record.provenance)
+        return cls(values, load_axes(record), record.provenance)
 
     def save(self, path: str | Path, compressed: bool = True) -> None:
         """Write the volume to an HDF5 file ``path``, ``compressed`` or not, whole or not at all."""

@@ -191,6 +191,12 @@ def find_distance(spot: FloatArray | None, grid: Grid) -> Float32Array:
     return np.asarray(np.sqrt(np.maximum(squared, MIN_DISTANCE_M**2)), np.float32)
 
 
+PointsPlan = tuple[DiffractionPlan, WallToPlane, float]
+"""Of groups of the same wall points: their way from a plane to the voxels, what carries each to that
+plane, and the fraction of time that this takes.
+"""
+
+
 class WaveMethod(PhasorMethod):
     """Imaging by waves, a field for every laser spot; `_plan_points` is what methods differ by."""
 
@@ -222,10 +228,8 @@ class WaveMethod(PhasorMethod):
     @abstractmethod
     def _plan_points(
         self, capture: Capture, group: IlluminationGroup, grid: Grid, band: Band, backend: Backend
-    ) -> tuple[DiffractionPlan, WallToPlane, float]:
-        """Plan groups of the same wall points: their way from a plane to the voxels, what carries
-        each to that plane, and the fraction of time that this takes.
-        """
+    ) -> PointsPlan:
+        """Plan groups of the same wall points."""
 
 
 def plan_waves(method: WaveMethod, capture: Capture, grid: Grid) -> WavePlan:
@@ -325,7 +329,7 @@ class PlanarRSD(WaveMethod):
 
     def _plan_points(
         self, capture: Capture, group: IlluminationGroup, grid: Grid, band: Band, backend: Backend
-    ) -> tuple[DiffractionPlan, WallToPlane, float]:
+    ) -> PointsPlan:
         wall = PlanarWall.of(capture.points[group.indices])
         if grid.z[0] <= wall.plane.z:
             raise InputError(
@@ -403,7 +407,7 @@ class Hybrid(WaveMethod):
 
     def _plan_points(
         self, capture: Capture, group: IlluminationGroup, grid: Grid, band: Band, backend: Backend
-    ) -> tuple[DiffractionPlan, WallToPlane, float]:
+    ) -> PointsPlan:
         points = capture.points[group.indices]
         if self.plane_z is not None:
             require_in_front(self.plane_z, points)

@@ -26,6 +26,19 @@ SHAPED_POINTS = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4], [
 SHAPED_JITTER, SHAPED_AXIS = 60e-12, TimeAxis(512, 32e-12)
 
 
+# Not centred on the wall, voxels finer than the wall's points along x and coarser along y, depths
+# unevenly spaced; and before walls of 2 m x 2 m.
+UNEVEN_DEPTHS = Grid(
+    np.arange(-0.3, 0.42, 0.05), np.arange(-0.4, 0.25, 0.06), [0.45, 0.5, 0.56, 0.65, 0.8]
+)
+SHAPED = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.85, 12), [0.62, 0.8, 1.0, 1.1, 1.45])
+# Depths an eighth of a wavelength apart, of which some are interpolated.
+FINE_DEPTHS = Grid(np.linspace(-0.3, 0.4, 5), np.linspace(-0.4, 0.2, 4), 0.4 + np.arange(32) / 64)
+FIVE_POINTS = np.array(
+    [[0.0, 0.05, 0.7], [0.3, -0.25, 0.8], [-0.35, 0.2, 0.85], [0.2, 0.4, 0.95], [-0.3, -0.4, 1.05]]
+)
+
+
 def planar_wall(rows=17, columns=21):
     """A wall of 1.2 m x 1 m at z = 0, rows downwards."""
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, columns), np.linspace(-0.5, 0.5, rows))

@@ -11,13 +11,16 @@ import numpy as np
 import pytest
 from exact_phasor_field import compute_exact_phasor_field
 from scenes import (
+    FINE_DEPTHS,
     JITTER,
     LONG,
+    SHAPED,
     SHAPED_JITTER,
     SHAPED_POINTS,
     SHAPED_SPOT,
     SPOTS,
     THREE_POINTS,
+    UNEVEN_DEPTHS,
     curved_wall,
     find_refusal,
     planar_wall,
@@ -38,9 +41,7 @@ from nlos.phasor.to_depths_compiled import DEPTH_ERROR_FRACTION
 from nlos.plane import Plane
 from tofclip.errors import InputError
 
-GRID = Grid(np.arange(-0.3, 0.42, 0.05), np.arange(-0.4, 0.25, 0.06), [0.45, 0.5, 0.56, 0.65, 0.8])
 METHOD, HYBRID = PlanarRSD(wavelength=0.125, cycles=3), Hybrid(wavelength=0.25, cycles=4.24)
-SHAPED = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.85, 12), [0.62, 0.8, 1.0, 1.1, 1.45])
 
 
 def scene(laser=SPOTS[0], wall=None):
@@ -81,18 +82,23 @@ def test_the_plane_may_stand_elsewhere_and_before_it_voxels_stay_sensible():
 
 UNEVEN = planar_wall()
 UNEVEN[:, 4, 0] += 0.02
-UNEVEN_VOXELS = Grid([0.0, 0.1, 0.3], GRID.y, GRID.z)
+UNEVEN_VOXELS = Grid([0.0, 0.1, 0.3], UNEVEN_DEPTHS.y, UNEVEN_DEPTHS.z)
 
 
 @pytest.mark.parametrize(
     ("method", "capture", "grid", "reason"),
     [
-        (METHOD, scene(wall=curved_wall()), GRID, "not a plane"),
-        (METHOD, scene(wall=UNEVEN), GRID, "not evenly spaced along x"),
-        (METHOD, scene("paired"), GRID, "laser spots"),
+        (METHOD, scene(wall=curved_wall()), UNEVEN_DEPTHS, "not a plane"),
+        (METHOD, scene(wall=UNEVEN), UNEVEN_DEPTHS, "not evenly spaced along x"),
+        (METHOD, scene("paired"), UNEVEN_DEPTHS, "laser spots"),
         (METHOD, scene(), UNEVEN_VOXELS, "voxels are not evenly spaced along x"),
-        (METHOD, scene(), Grid(GRID.x, GRID.y, [0.0, 0.5]), "must begin in front of the wall"),
-        (METHOD, scene(wall=planar_wall(1, 30)), GRID, "two different y"),
+        (
+            METHOD,
+            scene(),
+            Grid(UNEVEN_DEPTHS.x, UNEVEN_DEPTHS.y, [0.0, 0.5]),
+            "must begin in front of the wall",
+        ),
+        (METHOD, scene(wall=planar_wall(1, 30)), UNEVEN_DEPTHS, "two different y"),
         (HYBRID, see_shaped("relief", 9), UNEVEN_VOXELS, "evenly spaced along x"),
         (
             replace(HYBRID, plane_z=0.1),
@@ -110,7 +116,7 @@ def test_what_cannot_be_imaged_is_refused(method, capture, grid, reason):
 
 def test_too_many_plane_waves_are_refused(monkeypatch):
     monkeypatch.setattr(nlos.method, "MEMORY_LIMIT_BYTES", 1 << 16)
-    assert "plane waves" in find_refusal(METHOD, scene(), GRID)
+    assert "plane waves" in find_refusal(METHOD, scene(), UNEVEN_DEPTHS)
 
 
 @pytest.mark.parametrize(
@@ -132,9 +138,9 @@ def test_planes_are_checked(axes, message):
 
 def test_both_ways_back_from_the_spectrum_agree(monkeypatch):
     for grid in (
-        GRID,
-        Grid(GRID.x[::4], GRID.y[::3], GRID.z),
-        Grid(np.arange(-0.2, 0.2, 0.01), GRID.y, GRID.z[:1]),
+        UNEVEN_DEPTHS,
+        Grid(UNEVEN_DEPTHS.x[::4], UNEVEN_DEPTHS.y[::3], UNEVEN_DEPTHS.z),
+        Grid(np.arange(-0.2, 0.2, 0.01), UNEVEN_DEPTHS.y, UNEVEN_DEPTHS.z[:1]),
     ):
         fields = []
         # Matrix products, Fourier transforms, and a few spectra of these at a time.
@@ -147,7 +153,7 @@ def test_both_ways_back_from_the_spectrum_agree(monkeypatch):
 
 def test_images_without_fftw(monkeypatch):
     monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
-    cases = (METHOD, scene(), GRID), (HYBRID, truth("relief")[0], SHAPED)
+    cases = (METHOD, scene(), UNEVEN_DEPTHS), (HYBRID, truth("relief")[0], SHAPED)
     fields = [method.phasor_field(*rest).values for method, *rest in cases]
     monkeypatch.setattr(fourier, "pyfftw", None)
     for (method, *rest), expected in zip(cases, fields, strict=True):
@@ -174,13 +180,12 @@ def test_transforms_load_neither_dask_nor_pandas():
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
 def test_interpolated_depths_are_those_that_are_computed(laser, tolerance, monkeypatch):
     """Signals of noise: light from everywhere at any time; depths an eighth of a wavelength apart."""
-    grid = Grid(np.linspace(-0.3, 0.4, 5), np.linspace(-0.4, 0.2, 4), 0.4 + np.arange(32) / 64)
     signal = np.random.default_rng(1).normal(size=(LONG.bins, 17, 21)).astype(np.float32)
     capture = Capture(signal, planar_wall(), np.array(laser), LONG.bin_width, LONG.start)
     method = replace(METHOD, tolerance=tolerance)
-    found = method.phasor_field(capture, grid).values
+    found = method.phasor_field(capture, FINE_DEPTHS).values
     monkeypatch.setattr(nlos.phasor.depth_steps, "SPACING_RATIOS", ())
-    expected = method.phasor_field(capture, grid).values
+    expected = method.phasor_field(capture, FINE_DEPTHS).values
     assert 0 < relative_error(found, expected) < DEPTH_ERROR_FRACTION * tolerance
 
 

@@ -10,15 +10,18 @@ import pytest
 from exact_phasor_field import compute_exact_phasor_field
 from scenes import (
     AXIS,
+    FINE_DEPTHS,
     HIDDEN,
     JITTER,
     LONG,
+    SHAPED,
     SHAPED_JITTER,
     SHAPED_POINTS,
     SHAPED_SPOT,
     SHAPES,
     SPOTS,
     THREE_POINTS,
+    UNEVEN_DEPTHS,
     planar_wall,
     relative_error,
     see,
@@ -31,13 +34,7 @@ from nlos.capture import TimeAxis
 
 RSD, HYBRID = PlanarRSD(wavelength=0.125, cycles=3), Hybrid(wavelength=0.25, cycles=4.24)
 TOLERANCES = (1e-2, 1e-3)
-# Not centred on the wall, voxels finer than the wall's points along x and coarser along y, depths
-# unevenly spaced.
-GRID = Grid(np.arange(-0.3, 0.42, 0.05), np.arange(-0.4, 0.25, 0.06), [0.45, 0.5, 0.56, 0.65, 0.8])
 WIDE = Grid(np.linspace(-1.2, 1.2, 13), np.linspace(-1.2, 1.2, 13), [0.5, 0.7])
-# Depths an eighth of a wavelength apart, of which some are interpolated.
-FINE = Grid(np.linspace(-0.3, 0.4, 5), np.linspace(-0.4, 0.2, 4), 0.4 + np.arange(32) / 64)
-SHAPED = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.85, 12), [0.62, 0.8, 1.0, 1.1, 1.45])
 ACCEPTANCE = Grid([-0.6, -0.1, 0.4, 0.9], [-0.8, -0.2, 0.4], [0.62, 0.9, 1.4])
 RIM = Grid([-0.3, -0.05, 0.2, 0.45], [-0.4, -0.1, 0.2], [0.31, 0.45, 0.7])
 # Close before a plane the windows are narrowest, and far from it the phases turn slowest.
@@ -51,7 +48,7 @@ class Case:
 
     method: PlanarRSD | Hybrid
     see: Callable[[], Capture]
-    grid: Grid = GRID
+    grid: Grid = UNEVEN_DEPTHS
     tolerances: tuple[float, ...] = TOLERANCES
     fraction: float = 1.0
 
@@ -80,10 +77,10 @@ def list_cases():
     wide = Case(RSD, lambda: see_planar(SPOTS[0], [HIDDEN], long), WIDE, (1e-2,))
     yield "rsd, a field of view wider than the wall", wide
     for name, laser in (("on the wall", SPOTS[0]), ("ahead", [0.1, 0.0, 0.3])):
-        fine = Case(RSD, lambda laser=laser: see_planar(laser, THREE_POINTS[:2]), FINE)
+        fine = Case(RSD, lambda laser=laser: see_planar(laser, THREE_POINTS[:2]), FINE_DEPTHS)
         yield f"rsd, fine depths, laser {name}", fine
-    row = Grid(GRID.x, GRID.y[3:4], GRID.z[3:4])
-    for name, grid in (("a row", row), ("a voxel", Grid(GRID.x[9:10], row.y, row.z))):
+    row = Grid(UNEVEN_DEPTHS.x, UNEVEN_DEPTHS.y[3:4], UNEVEN_DEPTHS.z[3:4])
+    for name, grid in (("a row", row), ("a voxel", Grid(UNEVEN_DEPTHS.x[9:10], row.y, row.z))):
         yield f"rsd, {name}", Case(RSD, lambda: see_planar(SPOTS[0]), grid, (1e-2,))
     for shape in SHAPES:
         shaped = Case(HYBRID, lambda shape=shape: see_shaped(shape, 25), SHAPED)

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.linalg import norm
-from scenes import distance_to_nearest, energy_fraction, planar_wall, see
+from scenes import FIVE_POINTS, distance_to_nearest, energy_fraction, planar_wall, see
 
 from nlos import Capture, Grid, Hybrid
 from nlos.capture import TimeAxis
@@ -26,9 +26,6 @@ from nlos.refinement.photons import (
 from nlos.simulate import HiddenScene, PointScene, Surface, add_poisson_noise, build_relay_wall
 from tofclip.errors import InputError
 
-POINTS = np.array(
-    [[0.0, 0.05, 0.7], [0.3, -0.25, 0.8], [-0.35, 0.2, 0.85], [0.2, 0.4, 0.95], [-0.3, -0.4, 1.05]]
-)
 SIDE = np.linspace(-0.75, 0.75, 64)
 FINE = Grid(SIDE, SIDE, np.linspace(0.5, 1.25, 64))
 COARSE = Grid(SIDE[::2], SIDE[::2], FINE.z[::2])
@@ -41,7 +38,7 @@ BACKGROUND = 0.02
 @cache
 def expected(wall, scene, points):
     """Light of five points, or of two letters, before noise; one laser spot."""
-    hidden = PointScene(POINTS) if scene == "points" else letters()
+    hidden = PointScene(FIVE_POINTS) if scene == "points" else letters()
     return hidden.simulate_capture(build_relay_wall(wall, points), np.zeros(3), AXIS, 20e-12)
 
 
@@ -62,7 +59,7 @@ def count(wall, scene, photons, points, seed):
 def mask_of(scene, grid):
     """Voxels within 4 cm of a point, or that hold a piece of a letter."""
     if scene == "points":
-        return distance_to_nearest(grid, POINTS) <= 0.04
+        return distance_to_nearest(grid, FIVE_POINTS) <= 0.04
     mask = np.zeros(grid.shape, bool)
     for surface in letters().surfaces:
         for position in surface.positions:
@@ -94,12 +91,12 @@ def test_light_and_backprojection_are_adjoint(obliquity, laser):
 
 def test_a_small_voxels_light_is_that_of_a_point():
     capture = expected("cylinder", "points", 8)
-    x, y, z = POINTS[1]
+    x, y, z = FIVE_POINTS[1]
     grid = Grid(x + np.array([0.0, 1e-3]), y + np.array([0.0, 1e-3]), z + np.array([0.0, 1e-3]))
     response = np.exp(-((np.arange(-4, 5) / (20 / 32)) ** 2) / 2)
     model = TimeOfFlight(capture, grid, response / response.sum())
     light = model.compute_light(np.ones(1), np.zeros(1, int), np.arange(64))
-    true = see(POINTS[1:2], capture.wall, capture.laser, AXIS).traces()
+    true = see(FIVE_POINTS[1:2], capture.wall, capture.laser, AXIS).traces()
     assert np.allclose(light.sum(axis=1), true.sum(axis=1), rtol=3e-4)
     arrival, exact = ((one * AXIS.paths).sum(axis=1) / one.sum(axis=1) for one in (light, true))
     # float32 paths

@@ -15,6 +15,7 @@ from scenes import (
     LONG,
     SPOTS,
     THREE_POINTS,
+    UNEVEN_DEPTHS,
     curved_wall,
     find_refusal,
     planar_wall,
@@ -51,9 +52,7 @@ from tofclip.arrays import ComputeDevice, to_numpy
 from tofclip.errors import InputError
 
 libraries = pytest.mark.parametrize("library", DEVICE_NAMES)
-# Odd and even sizes, off the wall's middle, depths unevenly spaced.
-GRID = Grid(np.arange(-0.3, 0.42, 0.05), np.arange(-0.4, 0.25, 0.06), [0.45, 0.5, 0.56, 0.65, 0.8])
-FINE = Grid(GRID.x[:4], GRID.y[:3], 0.4 + np.arange(32) / 64)
+FINE = Grid(UNEVEN_DEPTHS.x[:4], UNEVEN_DEPTHS.y[:3], 0.4 + np.arange(32) / 64)
 # Unevenly spaced; the record (paths up to 1.63 m) ends before the farthest voxels.
 UNEVEN = Grid([-0.3, -0.1, 0.05, 0.15, 0.4], np.linspace(-0.4, 0.3, 7), [0.05, 0.4, 0.65, 1.2])
 SHAPED = Grid.box((-0.7, 0.6), (-0.5, 0.5), (0.7, 1.1), (0.13, 0.11, 0.1))
@@ -107,14 +106,14 @@ class Case:
 def list_cases():
     for name, laser in (("single", SPOTS[0]), ("two spots", SPOTS), ("confocal", "confocal")):
         strict = replace(RSD, tolerance=1e-3 if name == "single" else 1e-2)
-        yield f"rsd, {name}", Case(strict, see_planar(laser), GRID, 1e-5)
+        yield f"rsd, {name}", Case(strict, see_planar(laser), UNEVEN_DEPTHS, 1e-5)
         yield f"rsd, fine depths, {name}", Case(RSD, see_planar(laser), FINE, 2e-5)
     masked = mask(see_planar(), (3, 5), (0, 0))
-    yield "rsd, masked", Case(RSD, masked, GRID, 1e-5)
-    yield "rsd, listed", Case(RSD, shuffle(masked), GRID, 1e-5)
+    yield "rsd, masked", Case(RSD, masked, UNEVEN_DEPTHS, 1e-5)
+    yield "rsd, listed", Case(RSD, shuffle(masked), UNEVEN_DEPTHS, 1e-5)
     # A single voxel has no spacing, and one straight before the laser no way across.
     yield "rsd, one voxel", Case(RSD, see_planar(), Grid([0.12], [0.05], [0.6]), 1e-5)
-    row = Grid(GRID.x, GRID.y[3:4], GRID.z[3:4])
+    row = Grid(UNEVEN_DEPTHS.x, UNEVEN_DEPTHS.y[3:4], UNEVEN_DEPTHS.z[3:4])
     yield "rsd, one row", Case(RSD, see_planar("confocal"), row, 1e-5)
     spot = np.array([0.1, 0.05, 0.02])
     for shape, laser in (("wavy", spot), ("plates", "confocal"), ("cylinder", "confocal")):
@@ -183,8 +182,8 @@ def test_the_field_on_a_plane_is_that_of_the_compiled_loops(
 
 @libraries
 def test_a_volume_looks_the_same_wherever_it_lives(library, tmp_path):
-    expected = RSD.reconstruct(see_planar(), GRID)
-    found = RSD.reconstruct(see_planar().on(find_device(library)), GRID)
+    expected = RSD.reconstruct(see_planar(), UNEVEN_DEPTHS)
+    found = RSD.reconstruct(see_planar().on(find_device(library)), UNEVEN_DEPTHS)
     here = found.on(ComputeDevice())
     projection, front = found.maximum_projection(), expected.maximum_projection()
     assert relative_error(projection.brightness, front.brightness) < 1e-5
@@ -195,7 +194,7 @@ def test_a_volume_looks_the_same_wherever_it_lives(library, tmp_path):
     found.save_picture(tmp_path / "volume.png")
     assert np.array_equal(Volume.load(tmp_path / "volume.h5").values, here.values)
     for suffix in (".npz", ".vti", ".exr", ".ply"):
-        even = Volume(found.values, Grid(GRID.x, GRID.y, np.arange(5.0)))
+        even = Volume(found.values, Grid(UNEVEN_DEPTHS.x, UNEVEN_DEPTHS.y, np.arange(5.0)))
         even.export(tmp_path / f"volume{suffix}")
     assert np.array_equal(np.load(tmp_path / "volume.npz")["values"], here.values)
 
@@ -252,7 +251,7 @@ def test_what_is_planned_images_many_captures(library, case):
 
 def test_what_is_planned_refuses_other_captures():
     capture = see_planar().on(find_device("torch"))
-    plan = RSD.plan(capture, GRID)
+    plan = RSD.plan(capture, UNEVEN_DEPTHS)
     for other, reason in (
         (replace(capture, wall=capture.wall + 0.01), "the wall is not"),
         (replace(capture, laser=capture.laser + 0.01), "the laser is not"),
@@ -310,17 +309,20 @@ def test_pieces_of_a_backprojection_make_up_the_whole_and_progress_counts_them(l
     ],
 )
 def test_methods_of_compiled_loops_refuse_in_one_line(laser, method):
-    reason = find_refusal(method, see_planar(laser).on(find_device("torch")), GRID)
+    reason = find_refusal(method, see_planar(laser).on(find_device("torch")), UNEVEN_DEPTHS)
     assert "NumPy arrays only" in reason
     assert "\n" not in reason
-    assert "NumPy" not in find_refusal(method, see_planar(laser), GRID)
+    assert "NumPy" not in find_refusal(method, see_planar(laser), UNEVEN_DEPTHS)
 
 
 def test_other_steps_of_compiled_loops_refuse_too():
     capture, spot = see_planar().on(find_device("torch")), np.zeros(3)
-    plane = HYBRID.plan(see_planar(), GRID).plane
+    plane = HYBRID.plan(see_planar(), UNEVEN_DEPTHS).plane
     for attempt, reason in (
-        (lambda: TransientImaging(RSD).image_gate(capture, GRID, 1e-9, 2e-9), "NumPy arrays only"),
+        (
+            lambda: TransientImaging(RSD).image_gate(capture, UNEVEN_DEPTHS, 1e-9, 2e-9),
+            "NumPy arrays only",
+        ),
         (capture.traces, "works on NumPy arrays"),
         (lambda: propagate(capture, plane, HYBRID.pulse, "time"), "propagation in time works on"),
         (lambda: remove_device_legs(capture, spot, spot), "unwarping works on NumPy arrays"),
@@ -403,7 +405,9 @@ def test_pytorch_differentiates_through_it(method):
 
     capture = see_planar()
     signal = torch.tensor(capture.signal, requires_grad=True)
-    brightness = method.phasor_field(replace(capture, signal=signal), GRID).values[2, 4, 9].real
+    brightness = (
+        method.phasor_field(replace(capture, signal=signal), UNEVEN_DEPTHS).values[2, 4, 9].real
+    )
     brightness.backward()
     # The field is linear in the signal: its gradient, applied to the signal, is the field. Sums in
     # single precision.

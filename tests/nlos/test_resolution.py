@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.linalg import norm
-from scenes import distance_to_nearest, energy_fraction, planar_wall, see
+from scenes import FIVE_POINTS, distance_to_nearest, energy_fraction, planar_wall, see
 from scipy.optimize import brentq
 
 from nlos import Grid, Hybrid, PlanarRSD
@@ -70,9 +70,6 @@ def test_the_limit_is_the_width_of_the_sum_that_defines_it():
 
 # --- the energy at hidden points
 
-POINTS = np.array(
-    [[0.0, 0.05, 0.7], [0.3, -0.25, 0.8], [-0.35, 0.2, 0.85], [0.2, 0.4, 0.95], [-0.3, -0.4, 1.05]]
-)
 AXIS = np.linspace(-0.75, 0.75, 64)
 GRID = Grid(AXIS, AXIS, np.linspace(0.5, 1.25, 64))
 PULSE = 0.125, 4.243  # an envelope of sigma 0.0884 m
@@ -82,7 +79,7 @@ METHODS = {"planar": PlanarRSD(*PULSE), "cylinder": Hybrid(*PULSE)}
 @cache
 def see_five(wall):
     """Five hidden points, 64 x 64 wall points over 2 m, one laser spot, 512 bins of 32 ps."""
-    return see(POINTS, build_relay_wall(wall, 64), [0.0, 0.0, 0.0], TimeAxis(512, 32e-12))
+    return see(FIVE_POINTS, build_relay_wall(wall, 64), [0.0, 0.0, 0.0], TimeAxis(512, 32e-12))
 
 
 def score(volume):
@@ -90,7 +87,7 @@ def score(volume):
     12 cm, and their mean magnitude over that of all others: a bright spot in the wrong place scores
     badly, however bright.
     """
-    near = distance_to_nearest(volume.grid, POINTS) <= 0.04
+    near = distance_to_nearest(volume.grid, FIVE_POINTS) <= 0.04
     magnitude = volume.magnitude.astype(np.float64)
     return energy_fraction(magnitude, near), magnitude[near].mean() / magnitude[~near].mean()
 
