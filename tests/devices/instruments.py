@@ -5,7 +5,9 @@ taggers with other habits.
 from time import monotonic, sleep
 
 import numpy as np
+import pytest
 
+import devices
 from devices.emulation.timetag import (
     CLOCK_HZ,
     MAX_TICK,
@@ -16,7 +18,7 @@ from devices.emulation.timetag import (
 from devices.source import Info, Ledger, as_bytes
 from devices.stream import Transfer
 from devices.timetag_codec import TimeTagCodec
-from tofclip.errors import DeviceTimeoutError
+from tofclip.errors import DeviceTimeoutError, InputError
 
 TAGS = TimeTagCodec()
 
@@ -59,6 +61,12 @@ class RepeatingFeed:
 
     def close(self):
         """Hold nothing."""
+
+
+def refuse(address, said, error=InputError):
+    """Require that an address is not opened, and what is said of it (a regular expression)."""
+    with pytest.raises(error, match=said):
+        devices.open(address)
 
 
 def take(source, records):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from instruments import finish, take
+from instruments import finish, refuse, take
 from numpy.testing import assert_allclose, assert_array_equal
 
 import devices
@@ -20,7 +20,6 @@ from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceNotFoundError,
     DeviceTimeoutError,
-    InputError,
     MissingDependencyError,
 )
 from tofclip.recovery import FixedFocus
@@ -281,11 +280,9 @@ def test_a_camera_that_goes_away(stand_in):
 def test_what_cannot_be_opened(stand_in):
     library = stand_in(SMALL, [])
     library.answers["get_pixel_format_as_string"] = "BayerRG8"
-    with pytest.raises(InputError, match="choose pixel_format"):
-        devices.open("aravis://")
+    refuse("aravis://", "choose pixel_format")
     library.gone_for = 99
-    with pytest.raises(DeviceNotFoundError, match="No camera found"):
-        devices.open("aravis://10.0.0.9")
+    refuse("aravis://10.0.0.9", "No camera found", DeviceNotFoundError)
 
 
 def test_without_the_library_one_line_names_it(monkeypatch):
@@ -293,8 +290,7 @@ def test_without_the_library_one_line_names_it(monkeypatch):
     monkeypatch.setattr("devices.aravis.SYSTEM_PACKAGES", ())
     monkeypatch.setitem(sys.modules, "gi", None)
     try:
-        with pytest.raises(MissingDependencyError, match=r"apt install python3-gi gir1\.2-aravis"):
-            devices.open("aravis://")
+        refuse("aravis://", r"apt install python3-gi gir1\.2-aravis", MissingDependencyError)
         assert find_cameras() == []
     finally:
         load_aravis.cache_clear()
