@@ -126,6 +126,8 @@ class TestLive:
         # the occluder and the person, each to a bin of 3 mm
         assert abs(depths[depths < 0.085] - 0.05).max() < 3e-3
         assert abs(depths[depths > 0.085] - 0.12).max() < 3e-3
+        light = between.view.cloud.intensity[depths > 0.085]
+        assert np.isin(light, between.pictures[CLIP_GATED].astype(light.dtype)).all()
         assert between.view.text == "hides 33 mm behind it; person at 70 mm: seen"
         # open before the occluder: its light is in the picture too; open after the person: no light
         # is

@@ -243,6 +243,7 @@ def test_a_region_leaves_out_what_stands_beside_the_plate(shell, monkeypatch):
     np.save("plate.npy", cube)
     line = f"calibrate range --target-m 0.5 plate.npy {PULSE} --focal-length-px 20 --out c.h5"
     figures = shell.figures(f"{line} --region 0 5 0 4")
+    assert figures["target_share"] == 1
     late = 1e3 * figures["time_zero_ns"] - 1e12 * LATE_S
     assert abs(late) < 4 * figures["time_zero_sigma_ps"] < 100
 
