@@ -14,7 +14,7 @@ FWHM = 300e-12
 BIN_M = SPEED_OF_LIGHT / 2 * BIN
 
 
-def make_surface(shape: tuple[int, int] = (80, 80), bins: int = 512) -> np.ndarray:
+def make_surface(shape=(80, 80), bins=512):
     """Slanted wall, ball, box and poles; arrival in bins."""
     rows, columns = shape
     y, x = np.mgrid[:rows, :columns] / np.maximum(shape, 2).reshape(2, 1, 1)
@@ -31,7 +31,7 @@ def make_surface(shape: tuple[int, int] = (80, 80), bins: int = 512) -> np.ndarr
     return surface
 
 
-def make_art(shape: tuple[int, int] = (120, 140), bins: int = 512, seed: int = 7) -> np.ndarray:
+def make_art(shape=(120, 140), bins=512, seed=7):
     """Many things before each other, with steep edges: discs, bars and slats at depths of their own."""
     noise = np.random.default_rng(seed)
     y, x = np.mgrid[: shape[0], : shape[1]]
@@ -51,7 +51,7 @@ def make_art(shape: tuple[int, int] = (120, 140), bins: int = 512, seed: int = 7
     return surface
 
 
-def find_edges(surface: np.ndarray, step: float = 6.0) -> np.ndarray:
+def find_edges(surface, step=6.0):
     """Pixels of which a neighbour lies further off than `step` bins."""
     padded = np.pad(surface, 1, mode="edge")
     rows, columns = surface.shape
@@ -60,13 +60,13 @@ def find_edges(surface: np.ndarray, step: float = 6.0) -> np.ndarray:
 
 
 def make_rates(
-    surface: np.ndarray,
-    signal: np.ndarray | float,
-    background: np.ndarray | float,
-    bins: int = 512,
-    fwhm: float = FWHM / BIN,
-    lengths: np.ndarray | None = None,
-) -> np.ndarray:
+    surface,
+    signal,
+    background,
+    bins=512,
+    fwhm=FWHM / BIN,
+    lengths=None,
+):
     """Expected photons, (rows, columns, bins): signal of each pixel, background of each bin; `lengths`
     of the bins of an uneven converter, of 1 in the mean.
     """
@@ -76,7 +76,7 @@ def make_rates(
     return np.asarray(signal)[..., np.newaxis] * np.diff(passed, axis=-1) + background * lengths
 
 
-def count_first_photons(rates: np.ndarray, cycles: int, seed: int) -> np.ndarray:
+def count_first_photons(rates, cycles, seed):
     """Histograms of a detector that counts the first photon of a cycle; `rates` of all cycles."""
     missed = np.exp(-np.cumsum(rates, axis=-1) / cycles)
     before = np.concatenate([np.ones_like(missed[..., :1]), missed[..., :-1]], axis=-1)
@@ -84,9 +84,7 @@ def count_first_photons(rates: np.ndarray, cycles: int, seed: int) -> np.ndarray
     return np.random.default_rng(seed).multinomial(cycles, share)[..., :-1]
 
 
-def spoil_pixels(
-    rates: np.ndarray, level: float, seed: int, share: float = 0.02
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def spoil_pixels(rates, level, seed, share=0.02):
     """Rates with hot pixels (so many photons a bin more: even, in a few bins only, or rising) and
     dead ones, and both masks.
     """

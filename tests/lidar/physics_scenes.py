@@ -20,7 +20,7 @@ Lambert's law and the fall-off with range to the place and the time at which the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -40,7 +40,6 @@ RAYS = 4  # across a pixel
 FINE = 4  # parts of a row in which light is gathered before the pulse spreads it
 RIM_PX, NEAR_M = 10, 0.03  # of the score: what lies nearer the rim is left out; what is one return
 MIN_FILL = 0.3  # of a pixel that a surface fills to count as a return that may be missed
-Vector = tuple[float, float, float]
 
 
 class Hits(NamedTuple):
@@ -64,7 +63,7 @@ class Surface:
     )
 
 
-def plate(name, centre: Vector, size, reflectance, yaw=0.0, pitch=0.0) -> Surface:
+def plate(name, centre, size, reflectance, yaw=0.0, pitch=0.0):
     """A rectangle; `reflectance` is a number or a function of (right, down), m; NaN: light passes."""
     right = np.array([np.cos(yaw), 0, np.sin(yaw)])
     down = np.array([np.sin(yaw) * np.sin(pitch), np.cos(pitch), -np.cos(yaw) * np.sin(pitch)])
@@ -83,7 +82,7 @@ def plate(name, centre: Vector, size, reflectance, yaw=0.0, pitch=0.0) -> Surfac
     return Surface(name, middle, float(np.hypot(*size)) / 2, meet)
 
 
-def sphere(name, centre: Vector, radius: float, reflectance: Any, directed=0.0) -> Surface:
+def sphere(name, centre, radius, reflectance, directed=0.0):
     middle = np.array(centre, float)
 
     def meet(origin, rays):
@@ -92,7 +91,7 @@ def sphere(name, centre: Vector, radius: float, reflectance: Any, directed=0.0) 
     return Surface(name, middle, radius, meet, directed)
 
 
-def cylinder(name, start: Vector, end: Vector, radius: float, reflectance: Any) -> Surface:
+def cylinder(name, start, end, radius, reflectance):
     """A round rod between two points, without its ends."""
     first, axis = np.array(start, float), np.array(end, float) - np.array(start, float)
     length = float(np.linalg.norm(axis))
@@ -110,7 +109,7 @@ def cylinder(name, start: Vector, end: Vector, radius: float, reflectance: Any) 
     return Surface(name, first + axis * length / 2, float(np.hypot(length / 2, radius)), meet)
 
 
-def meet_round(start, across, rays, radius, reflectance, flatten) -> Hits:
+def meet_round(start, across, rays, radius, reflectance, flatten):
     """The nearer meeting with a sphere, or with a rod where all is taken across its axis."""
     a, b = np.sum(across**2, axis=1), across @ start
     root = b * b - a * (start @ start - radius**2)
@@ -123,11 +122,11 @@ def meet_round(start, across, rays, radius, reflectance, flatten) -> Hits:
     return Hits(np.where(there, distance, np.inf), at / radius, np.broadcast_to(value, a.shape))
 
 
-def checker(side: float, dark: float, bright: float):
+def checker(side, dark, bright):
     return lambda u, v: np.where((np.floor(u / side) + np.floor(v / side)) % 2 > 0, bright, dark)
 
 
-def threads(spacing: float, width: float, reflectance: float):
+def threads(spacing, width, reflectance):
     """Gauze: threads both ways, light passes between them."""
     return lambda u, v: np.where((u % spacing < width) | (v % spacing < width), reflectance, np.nan)
 
@@ -135,7 +134,7 @@ def threads(spacing: float, width: float, reflectance: float):
 # --- scenes: about 2 to 4.5 m away; places and turns differ from seed to seed ------------------------
 
 
-def make_room(r) -> list[Surface]:
+def make_room(r):
     turn, lift = r.uniform(0.9, 1.1), r.uniform(-0.06, 0.06)
     return [
         plate("wall", (0, 0, 4.1), (3, 3), checker(0.4, 0.35, 0.6), yaw=r.uniform(-0.1, 0.1)),
@@ -145,7 +144,7 @@ def make_room(r) -> list[Surface]:
     ]
 
 
-def make_wires(r) -> list[Surface]:
+def make_wires(r):
     slope = r.uniform(-0.25, 0.25)
     return [
         plate("dark wall", (0, 0, 3.4), (3, 3), r.uniform(0.06, 0.09)),
@@ -156,7 +155,7 @@ def make_wires(r) -> list[Surface]:
     ]
 
 
-def make_gauze(r) -> list[Surface]:
+def make_gauze(r):
     spacing = r.uniform(0.006, 0.008)
     return [
         plate(
@@ -171,7 +170,7 @@ def make_gauze(r) -> list[Surface]:
     ]
 
 
-def make_table(r) -> list[Surface]:
+def make_table(r):
     shift = r.uniform(-0.05, 0.05)
     return [
         plate(
@@ -185,7 +184,7 @@ def make_table(r) -> list[Surface]:
     ]
 
 
-def make_person(where: Vector, r) -> list[Surface]:
+def make_person(where, r):
     x, y, z = where
     legs = [(-0.09, -0.12, 0.2, 0.75), (0.09, 0.14, 0.2, 0.75)]
     arms = [(-0.16, -0.3, -0.28, 0.05), (0.16, 0.32, -0.28, 0.0)]
@@ -200,7 +199,7 @@ def make_person(where: Vector, r) -> list[Surface]:
     ]
 
 
-def make_bush(r) -> list[Surface]:
+def make_bush(r):
     leaves = [
         plate("leaf", (0.36 + dx, 0.2 + dy, 2.3 + dz), (0.06, 0.09), r.uniform(0.3, 0.6), *turns)
         for dx, dy, dz, *turns in r.normal(0, (0.12, 0.16, 0.12, 0.6, 0.6), (70, 5))
@@ -212,7 +211,7 @@ def make_bush(r) -> list[Surface]:
     ]
 
 
-def make_stairs(r) -> list[Surface]:
+def make_stairs(r):
     steps = []
     for k in range(5):  # each a riser and a tread, further away the higher
         y, z = 0.42 - 0.2 * k, 2.2 + 0.28 * k
@@ -225,7 +224,7 @@ def make_stairs(r) -> list[Surface]:
     ]
 
 
-def make_lamp(r) -> list[Surface]:
+def make_lamp(r):
     x, turn = r.uniform(-0.15, 0.15), r.uniform(-0.5, 0.5)
     return [
         cylinder("cable", (x, -0.9, 2.5), (x, -0.2, 2.5), 0.006, 0.4),
@@ -237,7 +236,7 @@ def make_lamp(r) -> list[Surface]:
     ]
 
 
-def make_fence(r) -> list[Surface]:
+def make_fence(r):
     slats = [
         plate("slat", (x, 0.1, 2.4 + 0.3 * x), (0.045, 1.0), 0.6, 0.3)
         for x in np.arange(-0.6, 0.65, 0.1) + r.uniform(-0.03, 0.03)
@@ -273,7 +272,7 @@ class Seen(NamedTuple):
     light: np.ndarray
 
 
-def look(surfaces: list[Surface], origin, x, y, focal: float, focus_shift: float) -> Seen:
+def look(surfaces, origin, x, y, focal, focus_shift):
     """Follow rays through picture places (x, y), px from the axis; (rows, columns) arrays."""
     rays = np.stack([(x - focus_shift) / focal, y / focal, np.ones_like(x)], axis=-1)
     nearest = np.full(x.shape, np.inf)
@@ -319,7 +318,7 @@ class Shot:
     # a line for each return: row, column, range (m), surface, how much of the pixel it fills
     truth: np.ndarray
 
-    def locate(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def locate(self, xyz):
         """Row and column of the pixels in which points lie."""
         (rows, columns), focal = self.camera.image_shape, self.camera.focal_length_px
         away = focal * xyz[:, :2] / xyz[:, 2:]
@@ -327,7 +326,7 @@ class Shot:
             away[:, 0] + columns // 2
         ).astype(int)
 
-    def score(self, row, column, distance, sigma=None, doubt=None) -> dict[str, Any]:
+    def score(self, row, column, distance, sigma=None, doubt=None):
         """Of points (n,): `miss`, the fraction of true returns without a point within 30 mm in their
         pixel; `false`, that of points without a true return within 30 mm in 3 x 3 pixels (`is_false`:
         of each of `counted`); `median_mm`; `z` of each surface, robust spread of the errors over the
@@ -382,15 +381,15 @@ class Shot:
 
 
 def make_shot(
-    scene: str | Iterable[Surface],
-    seed: int = 0,
-    photons: float = 2000.0,
-    size: int = 128,
-    background: float = 2.0,
-    afterglow: float = 0.0,
-    haze: float = 0.0,
-    bend: float = 0.0,
-) -> Shot:
+    scene,
+    seed=0,
+    photons=2000.0,
+    size=128,
+    background=2.0,
+    afterglow=0.0,
+    haze=0.0,
+    bend=0.0,
+):
     """Simulate a shot whose brightest streak pixel expects `photons`. `scene`: one of `SCENES`, or
     surfaces; `background`: photons a pixel; `afterglow`: fraction of the light that comes late, by 400 ps
     in the mean; `haze`: fraction that is scattered along the slit, 10 columns far in the mean; `bend`:
@@ -459,7 +458,7 @@ def make_shot(
     return Shot(counts, np.arange(ROWS) * ROW_S, camera, true_camera, names, truth)
 
 
-def list_truth(surfaces, focal, size, random, side: int = 6) -> np.ndarray:
+def list_truth(surfaces, focal, size, random, side=6):
     """Every return of every pixel as the reference lenslet sees it: the mean range of what it sees of
     each surface.
     """

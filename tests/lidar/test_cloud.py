@@ -42,11 +42,11 @@ PROPERTIES = ("intensity", "range_sigma", "range", "return_number", "time")
 OPTIONAL = ("false_alarm", "reflectance")
 
 
-def make_camera(rows: int = 128, columns: int = 96, focal: float = 560.0, **others) -> Camera:
+def make_camera(rows=128, columns=96, focal=560.0, **others):
     return Camera([60.0], [0.0], (rows, columns), 200, focal_length_px=focal, **others)
 
 
-def make_cloud(points: int, seed: int, known: bool = False) -> PointCloud:
+def make_cloud(points, seed, known=False):
     random = np.random.default_rng(seed)
     column = random.uniform(0.1, 5, (6, points)).astype(np.float32)
     optional = {"false_alarm": column[4], "reflectance": column[5]} if known else {}
@@ -60,7 +60,7 @@ def make_cloud(points: int, seed: int, known: bool = False) -> PointCloud:
     )
 
 
-def make_returns(y, x, distance, bright, number, camera: Camera) -> Returns:
+def make_returns(y, x, distance, bright, number, camera):
     bright, distance = np.asarray(bright, np.float32), np.asarray(distance, np.float64)
     y, x = np.asarray(y, np.int32), np.asarray(x, np.int32)
     time, number = 2 * distance / SPEED_OF_LIGHT, np.asarray(number, np.uint8)
@@ -68,11 +68,11 @@ def make_returns(y, x, distance, bright, number, camera: Camera) -> Returns:
 
 
 @pytest.fixture(scope="module")
-def cloud() -> PointCloud:
+def cloud():
     return make_cloud(40, 1)
 
 
-def test_a_wall_across_the_axis_comes_out_flat_with_all_that_was_known() -> None:
+def test_a_wall_across_the_axis_comes_out_flat_with_all_that_was_known():
     wall, camera = 2.5, make_camera()
     rows, columns = np.indices(camera.image_shape).reshape(2, -1)
     right, down = (columns - 48) / 560.0, (rows - 64) / 560.0
@@ -90,7 +90,7 @@ def test_a_wall_across_the_axis_comes_out_flat_with_all_that_was_known() -> None
     assert cloud.provenance == {"of": "a test"}
 
 
-def test_x_is_right_y_is_down_and_the_axis_looks_forward() -> None:
+def test_x_is_right_y_is_down_and_the_axis_looks_forward():
     camera = make_camera(10, 20, focal=100.0)
     axis, right, below = compute_ray_directions(camera, [5, 5, 15], [10, 20, 10])
     np.testing.assert_allclose(axis, [0, 0, 1])
@@ -103,7 +103,7 @@ def test_x_is_right_y_is_down_and_the_axis_looks_forward() -> None:
     row=st.floats(0, 127),
     column=st.floats(0, 95),
 )
-def test_the_lens_is_undone(k, row, column) -> None:
+def test_the_lens_is_undone(k, row, column):
     camera = make_camera(focal=200.0, distortion=np.array(k))
     (direction,) = compute_ray_directions(camera, [row], [column])
     assert np.linalg.norm(direction) == pytest.approx(1, rel=1e-12)
@@ -124,12 +124,12 @@ def test_the_lens_is_undone(k, row, column) -> None:
         (4, (0.3 * (1 + 0.13**3), -0.2 * (1 + 0.13**3))),
     ],
 )
-def test_each_coefficient_of_the_lens_bends_as_published(place, expected) -> None:
+def test_each_coefficient_of_the_lens_bends_as_published(place, expected):
     found = distort_directions(np.array([0.3]), np.array([-0.2]), np.eye(5)[place])
     assert np.ravel(found) == pytest.approx(expected, abs=1e-12)
 
 
-def test_impossible_lenses_are_refused(tmp_path: Path) -> None:
+def test_impossible_lenses_are_refused(tmp_path):
     camera = make_camera(distortion=np.array([-9.0, 0, 0, 0, 0]))
     with pytest.raises(CalibrationError, match="too strong"):
         compute_ray_directions(camera, [0], [0])
@@ -140,7 +140,7 @@ def test_impossible_lenses_are_refused(tmp_path: Path) -> None:
             camera.replace(distortion=wrong)
 
 
-def test_columns_that_do_not_fit_are_refused() -> None:
+def test_columns_that_do_not_fit_are_refused():
     columns = [getattr(make_cloud(3, 0), name) for name in PROPERTIES]
     for positions, error, words in (
         (np.zeros((3, 2)), ShapeError, r"positions of a point cloud must have shape \(points, 3\)"),
@@ -154,7 +154,7 @@ def test_columns_that_do_not_fit_are_refused() -> None:
 @settings(max_examples=8)
 @given(points=st.integers(0, 40), seed=st.integers(0, 2**32 - 1), known=st.booleans())
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_every_format_brings_every_bit_back(tmp_path_factory, suffix, points, seed, known) -> None:
+def test_every_format_brings_every_bit_back(tmp_path_factory, suffix, points, seed, known):
     """LAS to a micrometre; doubt and reflectance only where they are known."""
     pytest.importorskip(LIBRARIES.get(suffix, "h5py"))
     cloud = make_cloud(points, seed, known)
@@ -172,7 +172,7 @@ def test_every_format_brings_every_bit_back(tmp_path_factory, suffix, points, se
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_damaged_and_foreign_files_are_refused_in_one_line(cloud, tmp_path, suffix) -> None:
+def test_damaged_and_foreign_files_are_refused_in_one_line(cloud, tmp_path, suffix):
     pytest.importorskip(LIBRARIES.get(suffix, "h5py"))
     path = tmp_path / f"scene{suffix}"
     cloud.save(path)
@@ -208,14 +208,14 @@ HEADERS = {
 
 
 @pytest.mark.parametrize("name", HEADERS)
-def test_tables_of_another_kind_are_refused(tmp_path, name) -> None:
+def test_tables_of_another_kind_are_refused(tmp_path, name):
     (tmp_path / name).write_bytes(HEADERS[name])
     words = "two columns of one name" if "twice" in name else name
     with pytest.raises(FileFormatError, match=words):
         PointCloud.load(tmp_path / name)
 
 
-def test_unknown_formats_and_places_are_refused(cloud, tmp_path, monkeypatch) -> None:
+def test_unknown_formats_and_places_are_refused(cloud, tmp_path, monkeypatch):
     listed = r"\.ply or \.pcd or \.csv or \.npz or \.las or \.laz or \.e57 or \.h5"
     with pytest.raises(InputError, match=f"must end in {listed}"):
         cloud.save(tmp_path / "scene.xyz")
@@ -234,12 +234,12 @@ def test_unknown_formats_and_places_are_refused(cloud, tmp_path, monkeypatch) ->
             cloud.save(tmp_path / f"absent{suffix}")
 
 
-def test_saving_is_all_or_nothing(cloud, tmp_path, monkeypatch) -> None:
+def test_saving_is_all_or_nothing(cloud, tmp_path, monkeypatch):
     path = tmp_path / "scene.ply"
     cloud.save(path)
     before = path.read_bytes()
 
-    def interrupted(file: Path, *_: object) -> None:
+    def interrupted(file, *_):
         file.write_bytes(b"half")
         raise KeyboardInterrupt
 
@@ -251,7 +251,7 @@ def test_saving_is_all_or_nothing(cloud, tmp_path, monkeypatch) -> None:
     assert stat.S_IMODE(path.stat().st_mode) & stat.S_IRUSR
 
 
-def test_files_say_their_units_and_numpy_reads_them(cloud, tmp_path) -> None:
+def test_files_say_their_units_and_numpy_reads_them(cloud, tmp_path):
     for suffix, end in ((".ply", b"element"), (".pcd", b"0 0 0 1")):
         cloud.save(tmp_path / f"scene{suffix}")
         header = (tmp_path / f"scene{suffix}").read_bytes().split(end)[0]
@@ -269,7 +269,7 @@ def test_files_say_their_units_and_numpy_reads_them(cloud, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
-def test_open3d_reads_the_same_points(open3d, tmp_path, suffix) -> None:
+def test_open3d_reads_the_same_points(open3d, tmp_path, suffix):
     cloud = make_cloud(200, 1, known=True)
     path = str(tmp_path / f"scene{suffix}")
     cloud.save(path)
@@ -287,7 +287,7 @@ def test_open3d_reads_the_same_points(open3d, tmp_path, suffix) -> None:
     assert np.ptp(seen) > 0.5
 
 
-def test_pye57_reads_e57_and_failed_files_are_closed(cloud, tmp_path) -> None:
+def test_pye57_reads_e57_and_failed_files_are_closed(cloud, tmp_path):
     pye57 = pytest.importorskip("pye57")
     path = tmp_path / "scene.e57"
     cloud.save(path)
@@ -305,7 +305,7 @@ def test_pye57_reads_e57_and_failed_files_are_closed(cloud, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
-def test_laspy_reads_micrometres_and_all_columns_with_their_units(cloud, tmp_path, suffix) -> None:
+def test_laspy_reads_micrometres_and_all_columns_with_their_units(cloud, tmp_path, suffix):
     laspy = pytest.importorskip("laspy")
     cloud.save(tmp_path / f"scene{suffix}")
     seen = laspy.read(tmp_path / f"scene{suffix}")
@@ -321,14 +321,14 @@ def test_laspy_reads_micrometres_and_all_columns_with_their_units(cloud, tmp_pat
     assert seen.intensity.max() == 65535
 
 
-def make_two_walls() -> Returns:
+def make_two_walls():
     """Pixels of a picture of 4 x 6: a wall at 2 m with a window, one at 3 m, both in one pixel."""
     y, x, distance = [0, 1, 2, 2, 3], [5, 2, 3, 3, 0], [2, 3, 2, 3, 2]
     camera = make_camera(4, 6, focal=10.0)
     return make_returns(y, x, distance, [1, 2, 1, 4, 3], [1, 1, 1, 2, 1], camera)
 
 
-def test_one_return_of_each_pixel_is_chosen() -> None:
+def test_one_return_of_each_pixel_is_chosen():
     returns = make_two_walls()
     assert returns.select("all") is returns
     assert returns.select("first").range.tolist() == [2, 3, 2, 2]
@@ -341,7 +341,7 @@ def test_one_return_of_each_pixel_is_chosen() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npz", ".csv"])
-def test_organised_clouds_have_a_place_for_every_pixel(open3d, tmp_path, suffix) -> None:
+def test_organised_clouds_have_a_place_for_every_pixel(open3d, tmp_path, suffix):
     returns, path = make_two_walls().select("first"), tmp_path / f"scene{suffix}"
     assert save_organised(returns, path) == 4
     there = point_cloud(returns)
@@ -361,14 +361,14 @@ def test_organised_clouds_have_a_place_for_every_pixel(open3d, tmp_path, suffix)
     np.testing.assert_allclose(back.range_sigma, there.range_sigma)
 
 
-def test_what_cannot_be_organised_is_refused(tmp_path) -> None:
+def test_what_cannot_be_organised_is_refused(tmp_path):
     with pytest.raises(InputError, match="one point for a pixel"):
         save_organised(make_two_walls(), tmp_path / "scene.pcd")
     with pytest.raises(InputError, match=r"\.pcd, \.ply, \.npz, \.csv"):
         save_organised(make_two_walls().select("last"), tmp_path / "scene.las")
 
 
-def test_depth_pictures_hold_metres_along_the_axis(tmp_path) -> None:
+def test_depth_pictures_hold_metres_along_the_axis(tmp_path):
     y, x, bright = [0, 2, 2, 5], [8, 4, 4, 1], [5, 1, 7, 2]
     camera = make_camera(6, 9, focal=10.0)
     returns = make_returns(y, x, [2.0, 1.5, 3.0, 2.5], bright, [1, 1, 2, 1], camera)

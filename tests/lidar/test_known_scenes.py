@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-from physics_scenes import Shot, make_shot, plate
+from physics_scenes import make_shot, plate
 
 import tofclip
-from tofclip.camera import Camera
 
 
-def recover(shot: Shot, camera: Camera | None = None) -> tofclip.Frames:
+def recover(shot, camera=None):
     streak = tofclip.Streak(shot.counts, shot.row_times)
     return tofclip.recover(streak, camera or shot.true_camera, "tv")
 
 
-def find_points(shot: Shot) -> tofclip.PointCloud:
+def find_points(shot):
     return tofclip.point_cloud(tofclip.depth(recover(shot)))
 
 
-def score(shot: Shot, cloud: tofclip.PointCloud) -> dict[str, Any]:
+def score(shot, cloud):
     return shot.score(*shot.locate(cloud.xyz), cloud.range, cloud.range_sigma, cloud.false_alarm)
 
 
-def test_small_plates_lie_where_they_are() -> None:
+def test_small_plates_lie_where_they_are():
     """To a tenth of a pixel and a tenth of a millimetre, as the brightness of their pixels says."""
     plates = [
         plate(
@@ -47,7 +44,7 @@ def test_small_plates_lie_where_they_are() -> None:
         assert np.average(late[own], weights=weights) == pytest.approx(0, abs=2e-4)
 
 
-def test_a_plane_is_found_with_a_millimetre_s_error() -> None:
+def test_a_plane_is_found_with_a_millimetre_s_error():
     shot = make_shot([plate("wall", (0, 0, 3.0), (4, 4), 0.6, yaw=0.1)], size=64)
     cloud = find_points(shot)
     found = score(shot, cloud)
@@ -57,7 +54,7 @@ def test_a_plane_is_found_with_a_millimetre_s_error() -> None:
 
 
 @pytest.mark.nightly
-def test_a_delay_that_is_curved_along_the_slit_is_found_from_the_shot() -> None:
+def test_a_delay_that_is_curved_along_the_slit_is_found_from_the_shot():
     """Three rows are 9 mm. All but the reference view's own delay is found, which is time zero."""
     shot = make_shot("bush", seed=2, size=64, bend=3.0)
     found = score(shot, tofclip.point_cloud(tofclip.depth(recover(shot, shot.camera))))
@@ -70,7 +67,7 @@ def test_a_delay_that_is_curved_along_the_slit_is_found_from_the_shot() -> None:
     ("scene", "missed", "false"),
     [pytest.param("room", 0.1, 0.02, marks=pytest.mark.nightly), ("wires", 0.06, 0.09)],
 )
-def test_rays_are_left_out_and_marked_where_all_points_are_asked_for(scene, missed, false) -> None:
+def test_rays_are_left_out_and_marked_where_all_points_are_asked_for(scene, missed, false):
     """All points have hardly a return missing; hardly any is false of those that are said to be sure, and
     most of those that are said to be false.
     """

@@ -10,7 +10,7 @@ import tofclip
 from tofclip.errors import InputError
 
 
-def recover(scene: str, photons: float) -> tuple[tofclip.Frames, dict]:
+def recover(scene, photons):
     shot = make_shot(scene, seed=2, photons=photons, size=64)
     streak = tofclip.Streak(shot.counts, shot.row_times)
     frames = tofclip.recover(streak, shot.true_camera, "surfaces")
@@ -31,7 +31,7 @@ def recover(scene: str, photons: float) -> tuple[tofclip.Frames, dict]:
 )
 def test_dim_and_small_things_are_seen_beside_bright_ones(
     scene, missed, false, too_small, too_large
-) -> None:
+):
     """A wall that is hundreds of times darker than a retroreflector, which is too small for a surface and
     holds most of the light; balls of ten pixels before a steep plate.
     """
@@ -62,6 +62,6 @@ def test_dim_and_small_things_are_seen_beside_bright_ones(
     assert stated[0.0][1] > 0.8 * score["counted"].sum()
 
 
-def test_a_dark_shot_is_called_dark() -> None:
+def test_a_dark_shot_is_called_dark():
     with pytest.raises(InputError, match="too dark for surfaces"):
         recover("bush", 5)

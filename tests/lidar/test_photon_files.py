@@ -162,7 +162,7 @@ def test_damaged_files_are_refused_in_one_line(name, counts, tmp_path):
     assert not any("\n" in line for line in lines)
 
 
-def draw_ball(shape, seed: int):
+def draw_ball(shape, seed):
     """A ball before a slanted wall, 5 signal photons a pixel and 0.02 of background a bin."""
     rows, columns, bins = shape
     noise = np.random.default_rng(seed)
@@ -242,7 +242,7 @@ def test_time_is_recognised_by_its_peak_where_it_is_not_the_longest(tmp_path):
     assert read_photons(tmp_path / "a.npy", BIN).image_shape == (30, 50)
 
 
-def refuse(path, match: str, read=lambda path: read_photons(path, BIN)):
+def refuse(path, match, read=lambda path: read_photons(path, BIN)):
     with pytest.raises((FileFormatError, InputError, StorageError), match=match):
         read(path)
 

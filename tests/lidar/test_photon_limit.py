@@ -36,7 +36,7 @@ def metres(time):
     return SPEED_OF_LIGHT * time / 2
 
 
-def histograms(arrival, photons, background, seed, pulse=None) -> np.ndarray:
+def histograms(arrival, photons, background, seed, pulse=None):
     """Photons thrown one by one from the pulse and evenly over the bins, not by the package."""
     noise = np.random.default_rng(seed)
     counts = noise.poisson(background, (arrival.size, BINS)).astype(float)
@@ -47,7 +47,7 @@ def histograms(arrival, photons, background, seed, pulse=None) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def detector() -> PhotonDetector:
+def detector():
     return PhotonDetector(Pulse.gaussian(FWHM), BIN, BINS)
 
 
@@ -75,7 +75,7 @@ def test_the_bound_is_that_of_the_whole_fisher_matrix(decay, width_ps, backgroun
     """
     sigma, photons, width = 25e-12, 50.0, width_ps * 1e-12
 
-    def expected(arrival: float, amount: float) -> np.ndarray:
+    def expected(arrival, amount):
         edges = (np.arange(-15, 60) - 0.5) * width - arrival
         cumulative = exponnorm.cdf(edges, decay / sigma, scale=sigma)
         return amount * np.diff(cumulative)
@@ -306,7 +306,7 @@ def test_accuracy_reports_what_was_asked(detector, monkeypatch):
     assert pieces.detection_rate == pytest.approx(1, abs=0.05)
 
 
-def count_blinded(rate, cycles: int, dead: int, seed: int):
+def count_blinded(rate, cycles, dead, seed):
     """Photon by photon: a detector that misses what comes within `dead` bins after a count."""
     arrivals = np.random.default_rng(seed).random((cycles, rate.size)) < 1 - np.exp(-rate)
     ready, counts = np.zeros(cycles, int), np.zeros(rate.size)

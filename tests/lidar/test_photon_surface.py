@@ -26,12 +26,12 @@ FWHM = 400e-12
 BIN_M = SPEED_OF_LIGHT / 2 * BIN
 
 
-def compute_robust_z(error: np.ndarray, sigma: np.ndarray) -> float:
+def compute_robust_z(error, sigma):
     ratio = error / sigma
     return float(1.4826 * np.median(np.abs(ratio - np.median(ratio))))
 
 
-def count_single(*places: tuple[int, int, int], photons: int = 1) -> np.ndarray:
+def count_single(*places, photons=1):
     cube = np.zeros((6, 8, 100))
     cube[tuple(np.transpose(places))] = photons
     return cube
@@ -57,7 +57,7 @@ def test_photons_that_show_no_surface_are_refused_for_what_they_are(cube, proble
         estimate_surface(PhotonImage.from_cube(cube, BIN), pulse)
 
 
-def test_events_and_cubes_are_the_same_photons() -> None:
+def test_events_and_cubes_are_the_same_photons():
     counts = np.random.default_rng(0).poisson(0.3, (4, 5, 16))
     photons = PhotonImage.from_cube(counts, BIN)
     np.testing.assert_array_equal(photons.histograms(slice(0, 20)), counts.reshape(20, 16))
@@ -75,7 +75,7 @@ def test_events_and_cubes_are_the_same_photons() -> None:
 
 
 @pytest.mark.nightly
-def test_a_recorded_face_is_as_its_long_exposure_shows(shared_data) -> None:
+def test_a_recorded_face_is_as_its_long_exposure_shows(shared_data):
     """With the pulse that its authors name; with the one that is learnt it is a golden figure."""
     folder = shared_data / "photons"
     if not folder.is_dir():
@@ -99,7 +99,7 @@ def test_a_recorded_face_is_as_its_long_exposure_shows(shared_data) -> None:
     assert 0.7 <= compute_robust_z(error, np.hypot(found.range_sigma[head], 3.2e-3)) <= 1.15
 
 
-def test_two_layers_are_both_found_and_none_twice() -> None:
+def test_two_layers_are_both_found_and_none_twice():
     noise = np.random.default_rng(4)
     y, x = np.mgrid[:48, :64]
     layers = (150 + 0.2 * x, np.where(np.hypot(y - 24, x - 30) < 14, 240 + 0.3 * y, 330.0))
@@ -127,7 +127,7 @@ def test_two_layers_are_both_found_and_none_twice() -> None:
     assert np.all(np.diff(returns.range[one_pixel]) > 0)
 
 
-def test_times_in_steps_of_the_counter_are_no_pulse() -> None:
+def test_times_in_steps_of_the_counter_are_no_pulse():
     """94,000 photons in 200,000 bins of 1 ps, counted in steps of 16 ps: pairs of equal times were
     taken for a pulse of a bin, and deviations 9000 times too small.
     """
@@ -152,7 +152,7 @@ def test_times_in_steps_of_the_counter_are_no_pulse() -> None:
     assert error.std() < 2000
 
 
-def test_the_search_keeps_to_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_search_keeps_to_its_memory(monkeypatch):
     """Tables of tiles on a long axis, and the labels that they leave: a 64th of the usual limit."""
     limit = matching.MAX_VOLUME_BYTES // 64
     monkeypatch.setattr(matching, "MAX_VOLUME_BYTES", limit)
@@ -171,7 +171,7 @@ def test_the_search_keeps_to_its_memory(monkeypatch: pytest.MonkeyPatch) -> None
     assert 8 * 128 * 128 * axis.numbers.size <= limit
 
 
-def test_a_further_surface_is_kept_where_chance_is_below_one_in_fifty() -> None:
+def test_a_further_surface_is_kept_where_chance_is_below_one_in_fifty():
     """Of a mean of one photon, four or more come with 1.90 %, three or more with 8.03 %."""
     response = BinnedResponse(Pulse.gaussian(FWHM).integrate_bins(BIN), BIN)
     bins_seen = 2 * (0.5 * response.width + 1) + 1
@@ -189,7 +189,7 @@ FWHM_BINS = 4.0
 
 
 @pytest.fixture(scope="module")
-def counts() -> np.ndarray:
+def counts():
     """A tilted wall, 4 signal and 4 background photons a pixel."""
     after = np.arange(HOT_BINS) - (70 + 0.5 * np.arange(COLUMNS))[:, np.newaxis]
     pulse = np.exp2(-((2 * after / FWHM_BINS) ** 2))
@@ -198,7 +198,7 @@ def counts() -> np.ndarray:
 
 
 @pytest.mark.parametrize("photons", [150, 1_000_000])
-def test_hot_pixels_are_found_and_do_not_say_what_the_pulse_is(counts, photons) -> None:
+def test_hot_pixels_are_found_and_do_not_say_what_the_pulse_is(counts, photons):
     cube, hot = counts.copy(), np.zeros((ROWS, COLUMNS), bool)
     assert not find_hot_pixels(PhotonImage.from_cube(cube, BIN)).any()
     noise = np.random.default_rng(1)
@@ -212,7 +212,7 @@ def test_hot_pixels_are_found_and_do_not_say_what_the_pulse_is(counts, photons) 
     assert measure_pulse_width(rest) == pytest.approx(FWHM_BINS * BIN, rel=0.15)
 
 
-def test_bright_surfaces_are_not_hot(counts) -> None:
+def test_bright_surfaces_are_not_hot(counts):
     cube = counts.copy()
     cube[5, 5, 100:105] += (500, 2500, 4000, 2500, 500)  # a retroreflector of one pixel
     cube[20:22, 20, 90] += 4000  # two pixels of a surface, a pulse shorter than a bin

@@ -13,7 +13,6 @@ from tofclip.lidar import Pulse
 from tofclip.lidar.photons import (
     PhotonCube,
     PhotonImage,
-    SurfaceImage,
     estimate_pixels,
     estimate_surface,
 )
@@ -26,17 +25,17 @@ TILES = 1 + 0.5 * np.sin(np.arange(80) / 9)  # brightness of the columns
 GIVEN = Pulse.gaussian(scenes.FWHM)
 
 
-def estimate(rates: np.ndarray, seed: int = 0, *pulse: Pulse | bool) -> SurfaceImage:
+def estimate(rates, seed=0, *pulse):
     counts = np.random.default_rng(seed).poisson(rates)
     return estimate_surface(PhotonImage.from_cube(counts, scenes.BIN), *pulse)
 
 
-def find_wrong(found: SurfaceImage, surface: np.ndarray) -> np.ndarray:
+def find_wrong(found, surface):
     """Pixels more than three bins off."""
     return np.abs(found.range / scenes.BIN_M - surface) > 3
 
 
-def require_true_deviations(found: SurfaceImage, surface: np.ndarray, most=1.3) -> None:
+def require_true_deviations(found, surface, most=1.3):
     """Robust: borders are told by the probability of an outlier. `surface`: in bins."""
     ratio = (found.range - surface * scenes.BIN_M) / found.range_sigma
     assert 0.7 < 1.4826 * np.nanmedian(np.abs(ratio)) < most

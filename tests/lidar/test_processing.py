@@ -23,12 +23,12 @@ NORMAL = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
 pytestmark = pytest.mark.usefixtures("open3d")
 
 
-def cloud_of(xyz: np.ndarray) -> PointCloud:
+def cloud_of(xyz):
     n, distance = np.arange(len(xyz)), np.linalg.norm(xyz, axis=1)
     return PointCloud(xyz, n + 1.0, 1e-3 + 0 * n, distance, 1 + n % 3, 1e-9 * n, {"of": "a test"})
 
 
-def plane_points(number: int, seed: int, noise: float = 1e-3) -> np.ndarray:
+def plane_points(number, seed, noise=1e-3):
     """Points around a plane at 2 m whose normal is known."""
     random = np.random.default_rng(seed)
     across = np.linalg.svd(NORMAL[np.newaxis])[2][1:]

@@ -32,7 +32,7 @@ def walk_at(signal):
     return WALK_M * np.log10(signal / REFERENCE)
 
 
-def list_returns(y, x, measured, signal, sigma, camera: Camera) -> Returns:
+def list_returns(y, x, measured, signal, sigma, camera):
     """One return in each of these pixels."""
     return Returns(
         y=y.astype(np.int32),
@@ -49,13 +49,13 @@ def list_returns(y, x, measured, signal, sigma, camera: Camera) -> Returns:
 class World:
     """An instrument whose faults are known, in front of a target."""
 
-    def __init__(self, seed: int, jitter_m: float = 0.0):
+    def __init__(self, seed, jitter_m=0.0):
         self.random = np.random.default_rng(seed)
         self.offsets = self.random.normal(0, OFFSET_M, SHAPE)
         self.response = np.exp(self.random.normal(0, 0.05, SHAPE))
         self.jitter_m = jitter_m
 
-    def see(self, distance: float, photons: float, percent: float = np.nan) -> TargetShot:
+    def see(self, distance, photons, percent=np.nan):
         """A shot of a plate that sends back this many photons from the axis."""
         y, x = np.indices(SHAPE).reshape(2, -1)
         cosine = compute_ray_directions(CAMERA, y, x)[:, 2]
@@ -68,19 +68,19 @@ class World:
         returns = list_returns(y, x, measured, signal, sigma, CAMERA)
         return TargetShot(returns, distance, RECORD, f"a plate at {distance:g} m", percent)
 
-    def see_all(self) -> list[TargetShot]:
+    def see_all(self):
         """Five shots whose brightness spans a factor of 100."""
         return list(map(self.see, (1.0, 1.5, 2.0, 2.5, 3.0), (5000, 1500, 500, 150, 50)))
 
 
-def find_lateness(fit) -> float:
+def find_lateness(fit):
     """Time zero that a fit should have found: it holds at the reference signal, which it chooses."""
     return LATE_S + 2 / SPEED_OF_LIGHT * walk_at(fit.calibration.reference_signal)
 
 
 @pytest.mark.parametrize("jitter_m", [0.0, 1e-3])
 @pytest.mark.nightly
-def test_deviations_are_true_over_seeds(jitter_m: float):
+def test_deviations_are_true_over_seeds(jitter_m):
     """Time zero off by 300 ps, 2 mm of walk a decade, offsets of 1 mm, with and without jitter of
     1 mm: what a thousand of a thousand and one runs of 64 seeds would give.
     """
@@ -228,7 +228,7 @@ ROOM_CAMERA = Camera(
 )
 
 
-def draw_scene(kind: str, random: np.random.Generator) -> np.ndarray:
+def draw_scene(kind, random):
     """Depths of a scene without a plate, m; NaN where nothing comes back."""
     y, x = np.indices(ROOM).reshape(2, -1)
     ray = compute_ray_directions(ROOM_CAMERA, y, x)
@@ -262,7 +262,7 @@ def draw_scene(kind: str, random: np.random.Generator) -> np.ndarray:
     return depth_m
 
 
-def see_depths(depth_m: np.ndarray, photons: float, random: np.random.Generator) -> TargetShot:
+def see_depths(depth_m, photons, random):
     """A shot of these depths, said to be of a target at 2 m."""
     y, x = np.indices(ROOM).reshape(2, -1)
     y, x, depth_m = (part[np.isfinite(depth_m)] for part in (y, x, depth_m))
@@ -274,7 +274,7 @@ def see_depths(depth_m: np.ndarray, photons: float, random: np.random.Generator)
 
 
 @pytest.mark.parametrize("kind", ["room", "slanted", "bush", "relief", "walls", "empty"])
-def test_a_scene_without_a_plate_is_refused(kind: str):
+def test_a_scene_without_a_plate_is_refused(kind):
     """Twelve seeds, bright and dim; a picosecond was stated for ranges wrong by metres."""
     for seed in range(12):
         random = np.random.default_rng(seed)
@@ -284,7 +284,7 @@ def test_a_scene_without_a_plate_is_refused(kind: str):
 
 
 @pytest.mark.parametrize("kind", ["near", "dim", "tilted", "small", "before a wall"])
-def test_a_plate_is_one(kind: str):
+def test_a_plate_is_one(kind):
     """Seven seeds: time zero is within four of its deviations, which are what photons make them."""
     for seed in range(7):
         random = np.random.default_rng(seed)

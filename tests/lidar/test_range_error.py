@@ -19,7 +19,7 @@ GATE_M = 9e-3
 FOCAL_PX = 300.0
 
 
-def look_at_planes(seed: int, smooth: float, noise: float, px: float = 2.3):
+def look_at_planes(seed, smooth, noise, px=2.3):
     """Two planes with errors that are alike over some pixels: correlations of 0.6 and 0.3 at 3 and 5.
 
     Total variation leaves 0.6 and 0.3 there on the demonstration's shot.
@@ -36,7 +36,7 @@ def look_at_planes(seed: int, smooth: float, noise: float, px: float = 2.3):
     return error.ravel(), (sigma, distance, 1 / slant.ravel(), pixel, SHAPE, GATE_M)
 
 
-def compute_robust_z(error: np.ndarray, sigma: np.ndarray) -> float:
+def compute_robust_z(error, sigma):
     return float(np.median(np.abs(error / sigma)) / 0.6745)
 
 
@@ -90,7 +90,7 @@ def test_a_second_surface_in_the_same_pixels_takes_no_part():
     assert np.isclose(total[::2], add_recovery_error(*returns), rtol=1e-6).mean() > 0.995
 
 
-def test_neighbours_count_within_a_ball_whose_radius_in_range_is_in_gates() -> None:
+def test_neighbours_count_within_a_ball_whose_radius_in_range_is_in_gates():
     """Three pixels aside of a radius of four, a ball is root 7 gates deep: 2.65."""
     pixel = np.array([24, 27, 27], np.int64)  # row 3, columns 3 and 6, of 7 x 7
     starts = np.searchsorted(pixel, np.arange(50))
@@ -103,7 +103,7 @@ def test_neighbours_count_within_a_ball_whose_radius_in_range_is_in_gates() -> N
         assert pooled[2] == 4.0
 
 
-def test_the_scatter_counts_the_numbers_that_a_quadratic_took() -> None:
+def test_the_scatter_counts_the_numbers_that_a_quadratic_took():
     """Six, of some twenty neighbours."""
     random, rows = np.random.default_rng(0), 4
     columns = 40 // rows - 1

@@ -23,26 +23,26 @@ BIN_M = SPEED_OF_LIGHT * BIN / 2
 EVERYTHING = Detection(min_scene_fraction=0, min_time_bin_fraction=0, min_pixel_fraction=0)
 
 
-def camera(rows: int = 1, columns: int = 1) -> Camera:
+def camera(rows=1, columns=1):
     return Camera(np.array([20.0]), np.array([0.1]), (rows, columns), 41, pulse_fwhm=FWHM)
 
 
-def even_times(bins: int) -> np.ndarray:
+def even_times(bins):
     return START + BIN * np.arange(bins)
 
 
-def gaussian(times: np.ndarray, arrivals: np.ndarray, heights: np.ndarray | float) -> np.ndarray:
+def gaussian(times, arrivals, heights):
     """(time, ...) traces of one return each, written out independently of the package's pulse."""
     late = (times.reshape(-1, *[1] * np.ndim(arrivals)) - arrivals) / FWHM
     return heights * np.exp(-4 * np.log(2) * late**2)
 
 
-def frames_of(values: np.ndarray, times: np.ndarray) -> Frames:
+def frames_of(values, times):
     """One row of pixels; `values` is (time, pixel)."""
     return Frames(values[:, np.newaxis, :].astype(np.float32), times, camera(1, values.shape[1]))
 
 
-def range_of(time: np.ndarray | float) -> np.ndarray | float:
+def range_of(time):
     return SPEED_OF_LIGHT * time / 2
 
 
@@ -210,7 +210,7 @@ def test_a_pulse_shorter_than_a_bin_still_gives_a_range():
 
 
 @pytest.mark.parametrize(("photons", "background"), [(20, 0.02), (200, 2.0)])
-def test_a_cube_of_counts_has_the_deviations_of_photons(photons: float, background: float) -> None:
+def test_a_cube_of_counts_has_the_deviations_of_photons(photons, background):
     """Those of least squares are four times too large; the bound is 3 sigma of 576 pixels' spread. Times
     are of flight, whatever the camera's time zero; strengths are those of photons from 1 m, and false
     alarms those of a pixel in a hundred.
@@ -315,7 +315,7 @@ def test_an_echo_weaker_than_the_limit_of_its_pixel_is_left_out():
         assert found.return_number.max() == returns
 
 
-def test_the_brightest_at_an_instant_is_looked_for_within_a_pulse_width_to_either_side() -> None:
+def test_the_brightest_at_an_instant_is_looked_for_within_a_pulse_width_to_either_side():
     """To a quarter of a width: what comes 0.8 widths after something bright is its streak, what comes
     1.4 widths after it is not.
     """

@@ -14,7 +14,7 @@ from tofclip.lidar.ros import StampedCloud, read_bag, write_bag
 pytest.importorskip("rosbags")
 
 
-def make_cloud(xyz: np.ndarray, seed: int = 0, **others) -> PointCloud:
+def make_cloud(xyz, seed=0, **others):
     random = np.random.default_rng(seed)
     columns = random.uniform(0.1, 5, (4, len(xyz))).astype(np.float32)
     number = random.integers(1, 4, len(xyz)).astype(np.uint8)
@@ -22,7 +22,7 @@ def make_cloud(xyz: np.ndarray, seed: int = 0, **others) -> PointCloud:
 
 
 @pytest.fixture(scope="module")
-def cloud() -> PointCloud:
+def cloud():
     return make_cloud(np.random.default_rng(1).normal(size=(40, 3)))
 
 

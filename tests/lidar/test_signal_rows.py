@@ -28,7 +28,7 @@ SHAPE = (32, 32)
 NOISE = 3.0
 
 
-def camera() -> Camera:
+def camera():
     sweep = SkewSweep(CENTRES, np.array([-2.0, 1.0, 0.0, 0.5, 3.0]), np.zeros(5))
     angles = np.arctan([0.6, -0.7, 0.3, -0.1, 0.9])
     optics = {"focal_length_px": 100.0, "lenslet_pitch": 2e-3, "focus_distance": 1.3}
@@ -52,16 +52,14 @@ def find_bins(inverse):
     return find
 
 
-def dark(seed: int) -> np.ndarray:
+def dark(seed):
     """Noise about a level of its own in each column, as a sensor has it."""
     random = np.random.default_rng(seed)
     level = random.normal(0, 2 * NOISE, (240, 1))
     return (level + random.normal(0, NOISE, (240, ROWS))).astype(np.float32)
 
 
-def with_pixel(
-    measurements: np.ndarray, pixel: tuple[int, int], row: float, strength: float
-) -> np.ndarray:
+def with_pixel(measurements, pixel, row, strength):
     """Add a pulse of one pixel that stands out by `strength` where every reading of it is matched."""
     picture = np.zeros(SHAPE, np.float32)
     picture[pixel] = 1
@@ -130,7 +128,7 @@ def test_blocks_with_an_operator_of_their_own_have_their_own_instants(find_bins)
     assert bins.bin_weights.sum() == pytest.approx(ROWS)
 
 
-def see_plates(seed: int, **settings):
+def see_plates(seed, **settings):
     """A shot of three plates and what makes its cloud."""
 
     def make(distance, place):
@@ -167,13 +165,13 @@ def test_returns_are_those_of_all_rows(focus, monkeypatch):
 NARROW = (21, 37)
 
 
-def narrow_camera(dead: int | None = None) -> Camera:
+def narrow_camera(dead=None):
     """Of three views, of which the first two overlap."""
     angles, dead_columns = np.radians([-40.0, 5.0, 35.0]), np.arange(170) == dead
     return Camera(np.array([30.0, 52.4, 140.2]), angles, NARROW, 170, dead_columns=dead_columns)
 
 
-def filter_responses(matrix: np.ndarray, block: np.ndarray) -> np.ndarray:
+def filter_responses(matrix, block):
     """Largest response of the matched filter in each frame."""
     length = np.linalg.norm(matrix, axis=0)
     return (matrix.T @ block / np.where(length > 0, length, 1)[:, np.newaxis]).max(axis=0)

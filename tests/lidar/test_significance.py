@@ -15,7 +15,7 @@ SURFACE, RAY = (slice(6, 26), 30, 2000.0), (slice(14, 18), 70, 100.0)
 """Rows and columns, frame, counts."""
 
 
-def test_what_is_bright_is_not_dropped_for_what_is_dim_and_sure() -> None:
+def test_what_is_bright_is_not_dropped_for_what_is_dim_and_sure():
     """Where an instant is full of light, what the model does not explain of it makes every pixel
     uncertain; a dim ray in the dark is surer than a bright surface, and no reason to drop it.
     """
@@ -44,7 +44,7 @@ def test_what_is_bright_is_not_dropped_for_what_is_dim_and_sure() -> None:
     assert found[place, place].mean() > 0.95  # corners have few neighbours
 
 
-def test_the_significance_of_a_candidate_is_its_height_over_its_deviation() -> None:
+def test_the_significance_of_a_candidate_is_its_height_over_its_deviation():
     """In even noise, of one pixel whose light is known to have the pulse's course: the deviation of
     its height by least squares over all measurements of all frames.
     """

@@ -31,7 +31,7 @@ SIDE, BINS = 8, 60
 TIMES = 10e-9 + BIN * np.arange(BINS)
 
 
-def look(arrivals_bins: np.ndarray, times: np.ndarray, noise: float = 0.0) -> Frames:
+def look(arrivals_bins, times, noise=0.0):
     """One return in each pixel, this many bins after the first."""
     after = times[:, np.newaxis] - (times[0] + BIN * arrivals_bins)
     values = 100 * Pulse.gaussian(FWHM)(after) + 3.0
@@ -84,7 +84,7 @@ def test_returns_that_overlap_are_fitted_as_exactly(apart):
     np.testing.assert_allclose(by_table.confidence, exact.confidence, rtol=2e-2)
 
 
-def add_dim(bright: Frames, dim: Frames) -> Frames:
+def add_dim(bright, dim):
     return replace(bright, values=bright.values + np.float32(0.3) * dim.values)
 
 
