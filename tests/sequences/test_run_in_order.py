@@ -84,16 +84,6 @@ def test_the_oldest_of_those_that_wait_are_dropped(worker):
     assert [item.number for item in items] == [0, 3, 4, 5]
 
 
-def test_slow_work_drops_the_oldest_where_that_is_wanted(worker):
-    source = count(20, STEP / 5)
-    items = list(run_in_order(source, slow, worker, at_once=1, policy="drop_oldest"))
-    numbers = [item.number for item in items]
-    assert numbers[-1] == 19  # the newest is never dropped
-    assert numbers == sorted(numbers)
-    assert 4 <= len(numbers) < 12
-    assert all(item.latency < 3.5 * STEP for item in items)
-
-
 def test_a_slow_consumer_gets_the_newest_where_that_is_wanted():
     source = count(40, STEP / 5)
     with ThreadPoolExecutor(3) as workers:
