@@ -78,6 +78,9 @@ class SurfaceState:
     # relative to the mean over the views. Through gauze the view beside the lamp sees just what the
     # lamp lights, and the others see a part of it
     shading: FloatArray
+    # (1,), how far the views' pictures end each where its own does, 1, or all where the reference's
+    # does, 0: by its parallax a view sees more or less of what the picture's outer columns see
+    borders: FloatArray
 
     @classmethod
     def start(cls, coefficients: Sequence[FloatArray], camera: Camera) -> SurfaceState:
@@ -85,7 +88,7 @@ class SurfaceState:
         none = np.zeros(camera.views)
         even = np.zeros((len(coefficients), camera.views))
         apart = camera.gains.copy(), none, none.copy(), none + 1, none.copy()
-        return cls(list(coefficients), *apart, even)
+        return cls(list(coefficients), *apart, even, np.zeros(1))
 
     def copy(self) -> SurfaceState:
         """Return a state that can be changed without changing this one."""
@@ -260,6 +263,7 @@ class SurfaceModel:
         self._x, self._y = self.column - axis_column, self.row - axis_row
         self.ray_length = 1 / self._directions[:, 2]
         self._beside = self._find_neighbours()
+        self.outer = np.flatnonzero(np.isin(self.column, [0, masks.shape[2] - 1]))
         self.behind = np.zeros(self.surface.size, bool)
 
     def cover(self, masks: NDArray[np.bool_]) -> SurfaceModel:
@@ -304,6 +308,11 @@ class SurfaceModel:
         self.places = Places.split(
             self.distance, self.compute_slopes(), self.pulse.sigma, self.row_m
         )
+        # (views, outer points), the fraction by which each view sees more or less of a point in the
+        # picture's outer columns than the reference view, if its picture ends where its own does
+        depth = self.distance[self.outer] / self.ray_length[self.outer]
+        left = np.where(self.column[self.outer] == 0, 1, -1) * self.camera.shear_at(depth)
+        self.excess = np.clip(np.outer(self.camera.view_positions, left), -1, 1)
         self.half = int(np.ceil(EXTENT_SIGMAS * MAX_LENGTHENING * self.pulse.sigma)) + 1
         self._margin = self.half + 3
         # rows before and behind the streak image whose light reaches it later or earlier
@@ -606,8 +615,13 @@ class SurfaceModel:
 
     def shade(self, view: int, amplitude: Image, part: slice = slice(None)) -> Image:
         """Return amplitudes, of the points in `part`, as a view sees them."""
-        if not self.state.shading[:, view].any():
-            return amplitude
-        behind, shaded = np.flatnonzero(self.behind[part]), amplitude.astype(np.float32)
-        shaded[behind] *= np.exp(self.state.shading[:, view])[self.surface[part][behind]]
+        shaded = amplitude.astype(np.float32)
+        if self.state.shading[:, view].any():
+            behind = np.flatnonzero(self.behind[part])
+            shaded[behind] *= np.exp(self.state.shading[:, view])[self.surface[part][behind]]
+        if self.state.borders.any():
+            first, last, _ = part.indices(self.surface.size)
+            own = slice(*np.searchsorted(self.outer, [first, last]))
+            seen = 1 + self.state.borders[0] * self.excess[view, own]
+            shaded[self.outer[own] - first] *= np.maximum(seen, 0)
         return shaded

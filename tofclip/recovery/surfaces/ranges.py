@@ -37,6 +37,7 @@ SMALLEST_STEP = 1 / 16  # of a Gauss-Newton step, halved until it lowers the mis
 # scenes by a forward model of their own (0.015 and 0.05 in the demonstration). Later views and farther
 # surfaces look alike, so that the mean over the views is what all ranges have in common.
 SWEEP_SIGMAS = {"delays": 0.1, "stretches": 0.3}
+KNOWN_SIGMAS = {**SWEEP_SIGMAS, "borders": 1.0}  # where pictures end nothing but the shot tells
 # Of a sweep that little light shows, its prior takes a part of the correction, and ranges take it on:
 # how much the prior is believed there, and how many times of that a range is off. Walls and balls of
 # 200 photons are off by 1 to 4 times, of 2000 photons by less than what the covariance says.
@@ -87,6 +88,7 @@ def iterate_derivatives(model: SurfaceModel, amplitude: Image) -> Iterator[Deriv
     for work, numbers in (
         (_differentiate_view, views),
         (_differentiate_sweep, others),
+        (_differentiate_borders, range(1)),
         (_differentiate_surface, surfaces),
     ):
         parts = map_parallel(partial(work, model, amplitude), numbers)
@@ -163,6 +165,15 @@ def _differentiate_sweep(model: SurfaceModel, amplitude: Image, view: int) -> li
         lights = light, light * place.height
         windows.append([model.receive(other, one.astype(np.float32), slope) for one in lights])
     return [*_join_windows(model, [("delays", 0, view), ("stretches", 0, view)], windows)]
+
+
+def _differentiate_borders(model: SurfaceModel, amplitude: Image, _: int) -> list[Derivatives]:
+    windows = []
+    for view, (kernel, gain) in enumerate(zip(model.kernels, model.state.gains, strict=True)):
+        light = np.zeros_like(amplitude)
+        light[model.outer] = amplitude[model.outer] * model.excess[view]
+        windows.append([model.receive(view, light, np.float32(gain) * kernel)])
+    return [*_join_windows(model, [("borders", 0, 0)], windows)]
 
 
 def _differentiate_surface(
@@ -511,7 +522,7 @@ def compute_objective(model: SurfaceModel, rest: Image) -> float:
     bases = zip(model.bases, state.coefficients, strict=True)
     bent = sum(float(c @ basis.bending @ c) for basis, c in bases)
     swept = sum(
-        float(np.sum(getattr(state, name) ** 2)) / sigma**2 for name, sigma in SWEEP_SIGMAS.items()
+        float(np.sum(getattr(state, name) ** 2)) / sigma**2 for name, sigma in KNOWN_SIGMAS.items()
     )
     moved = float(state.centres @ weigh_centres(model.camera) @ state.centres)
     return (float(np.sum(model.weights * rest**2, dtype=np.float64)) + bent + swept + moved) / 2
@@ -543,9 +554,9 @@ def _differentiate_priors(
             own = index - number + np.arange(bending.size)
             second[index, own] = bending
             first[index] = bending @ model.state.coefficients[surface]
-        elif name in SWEEP_SIGMAS:
-            second[index, index] = 1 / SWEEP_SIGMAS[name] ** 2
-            first[index] = getattr(model.state, name)[number] / SWEEP_SIGMAS[name] ** 2
+        elif name in KNOWN_SIGMAS:
+            second[index, index] = 1 / KNOWN_SIGMAS[name] ** 2
+            first[index] = getattr(model.state, name)[number] / KNOWN_SIGMAS[name] ** 2
     return second, first
 
 
