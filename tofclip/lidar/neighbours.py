@@ -26,6 +26,14 @@ from tofclip.arrays import Float32Array, FloatArray, IntArray
 from tofclip.compiling import compile_as_part, compile_loop, inlined
 from tofclip.threads import run_blocks
 from tofclip.units import MAD_TO_SIGMA
+from tofclip.vectors import (
+    STEP,
+    choose,
+    count_set_lanes,
+    fill_vector,
+    find_highest_lane,
+    load_vector,
+)
 
 fit_part = compile_as_part(fastmath=True, _nrt=False)
 
@@ -250,10 +258,12 @@ def find_median(memory, count, guess):
 @inlined
 def count_used_below(memory, limit):
     """How many of those used are off by at most `limit`."""
-    used, residual, below = memory[USED], memory[RESIDUAL], np.float32(0)
-    for t in range(NEIGHBOURS):
-        below += used[t] if residual[t] <= limit else np.float32(0)
-    return int(below)
+    used, residual, below = memory[USED], memory[RESIDUAL], 0
+    most, zero = fill_vector(limit), fill_vector(np.float32(0))
+    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
+        near = most >= load_vector(residual, t)
+        below += count_set_lanes(near & (load_vector(used, t) > zero))
+    return below
 
 
 @fit_part
@@ -261,12 +271,14 @@ def find_residuals_beside(memory, limit):
     """The largest residual of those used that is at most `limit`, or 0, and the smallest above it, or
     `FAR`.
     """
-    used, residual, last, first = memory[USED], memory[RESIDUAL], np.float32(0), np.float32(FAR)
-    for t in range(NEIGHBOURS):
-        here, counted = residual[t], used[t] > 0
-        last = max(last, here if counted & (here <= limit) else np.float32(0))
-        first = min(first, here if counted & (here > limit) else np.float32(FAR))
-    return last, first
+    used, residual = memory[USED], memory[RESIDUAL]
+    most, zero = fill_vector(limit), fill_vector(np.float32(0))
+    last, first = zero, fill_vector(np.float32(FAR))
+    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
+        here, counted = load_vector(residual, t), load_vector(used, t) > zero
+        last = choose(counted & (most >= here) & (here > last), here, last)
+        first = choose(counted & (here > most) & (first > here), here, first)
+    return find_highest_lane(last), -find_highest_lane(zero - first)
 
 
 @fit_part
@@ -301,11 +313,10 @@ def fit_quadratic(window, system):
 
 @fit_part
 def sum_used(window, row, factor):
-    """Sum over the neighbours that are used of one row, or of its products with another one."""
-    used, total = window[USED], np.float32(0)
+    """Sum over the neighbours that are used of the products of two rows; of one with `USED`, 1 there."""
+    used, one, other, total = window[USED], window[row], window[factor], np.float32(0)
     for t in range(NEIGHBOURS):
-        part = used[t] * window[row, t]
-        total += part if factor == USED else part * window[factor, t]
+        total += used[t] * one[t] * other[t]
     return float(total)
 
 
