@@ -557,11 +557,12 @@ class RemoteExFeed(FrameFeed):
                 raise
             except DeviceError:
                 # Refused, as no such picture is there: the numbers begin anew when live mode does,
-                # which the next announcement says.
-                expected = self._next
-                self._note_announcement(self._options.timeout_s)
-                if self._next == expected:
-                    raise
+                # which an announcement says, after those that were under way.
+                expected, deadline = self._next, monotonic() + self._options.timeout_s
+                while self._next == expected:
+                    if monotonic() > deadline:
+                        raise
+                    self._note_announcement(self._options.timeout_s)
         lost = picture.number - self._next
         if lost < 0:
             raise ProtocolError(f"RemoteEx sent picture {picture.number}, asked for {self._next}")

@@ -402,6 +402,18 @@ def test_damage_is_found_and_the_rest_is_saved(tmp_path_factory, data):
     assert not verify(again).complete
 
 
+def test_a_block_that_is_gone_without_a_trace_is_missed(path, out):
+    pieces, gone = written(path), list_blocks(path, BlockKind.PIECE)[1]
+    content = path.read_bytes()
+    path.write_bytes(content[: gone.position] + content[gone.end :])
+    found = verify(path)
+    assert (found.damaged_blocks, found.damaged_bytes, found.complete) == (1, 0, False)
+    repair(path, out)
+    saved = replayed(out)
+    assert_array_equal(joined(saved), np.concatenate([pieces[0], *pieces[2:]]))
+    assert [number for number, batch in enumerate(saved) if batch.after_gap] == [1]
+
+
 def test_a_file_without_its_front_and_end_is_rebuilt(path, out):
     pieces = written(path, finish=False)
     path.write_bytes(bytes(2000) + path.read_bytes()[2000:-20])
