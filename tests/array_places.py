@@ -4,8 +4,6 @@ Where there is a graphics processor, ``TOFCLIP_TEST_DEVICES=cuda pytest -k "port
 tries it as well.
 """
 
-from __future__ import annotations
-
 import os
 
 import pytest
@@ -15,7 +13,7 @@ from tofclip.arrays import ComputeDevice, parse_device
 DEVICE_NAMES = ("array_api_strict", "torch", *os.environ.get("TOFCLIP_TEST_DEVICES", "").split())
 
 
-def find_device(name: str) -> ComputeDevice:
+def find_device(name):
     """Return a library's processor, or the device of that name; skip the test where the library is
     not installed.
     """

@@ -1,7 +1,5 @@
 """What every test may ask for, and what holds for all of them on any machine."""
 
-from __future__ import annotations
-
 import faulthandler
 import gc
 import os
@@ -9,10 +7,7 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Generator
 from pathlib import Path
-from types import ModuleType
-from typing import TypeVar
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Workers share the cores: products on threads of their own would only wait for each other.
@@ -37,7 +32,7 @@ settings.load_profile("day")
 
 
 @pytest.fixture(scope="session")
-def open3d() -> ModuleType:
+def open3d():
     """Open3D; what needs it is skipped where it has no wheel."""
     try:
         return import_open3d()
@@ -50,7 +45,7 @@ ROOMS_OF_LONG_FILES = {"viewer", "apps"}
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Keep the tests of a file on one worker, so that it makes what they share once; the longest
     files come first, so that no worker has one left at the end.
 
@@ -62,7 +57,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
-def pytest_collection_finish() -> None:
+def pytest_collection_finish():
     """Look for no garbage among what was imported: it took one second of twenty-five."""
     gc.freeze()
 
@@ -72,7 +67,7 @@ SECONDS_TO_END = 120.0
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_sessionfinish() -> None:
+def pytest_sessionfinish():
     """Let no worker that hangs after its last test keep all others: it says where, and ends.
 
     Tests that hang are ended likewise, by `faulthandler_timeout`.
@@ -81,7 +76,6 @@ def pytest_sessionfinish() -> None:
         faulthandler.dump_traceback_later(SECONDS_TO_END, exit=True, file=sys.__stderr__)
 
 
-Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 STRICT = "TOFCLIP_KNOWN_SKIPS_ONLY" in os.environ
 
 KNOWN_SKIPS = {
@@ -94,18 +88,18 @@ KNOWN_SKIPS = {
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+def pytest_runtest_makereport():
     report = yield
     return refuse_unknown_skip(report)
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+def pytest_make_collect_report():
     report = yield
     return refuse_unknown_skip(report)
 
 
-def refuse_unknown_skip(report: Report) -> Report:
+def refuse_unknown_skip(report):
     """Let a skip fail in .ci/run if no reason that is known says why: what is not tested is said."""
     if not report.skipped or hasattr(report, "wasxfail") or not STRICT:
         return report
@@ -121,7 +115,7 @@ def refuse_unknown_skip(report: Report) -> Report:
 
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
+def shared_data():
     """Folder with the instruments' recorded data; tests that need it are skipped where it is
     absent.
     """

@@ -1,28 +1,19 @@
 """ITEX pictures as HPD-TA writes them."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofclip.io.hamamatsu import ITEX_HEADER, PIXEL_TYPES, SIGNATURE
 
 
-def encode_itex(
-    pixels: NDArray[Any],
-    text: str,
-    tables: Mapping[str, NDArray[Any]] = {},
-    offset_px: tuple[int, int] = (0, 0),
-) -> bytes:
+def encode_itex(pixels, text, tables=None, offset_px=(0, 0)):
     """Return the bytes of an ITEX file, the tables (of X and Y) right behind the pixels, X first.
 
     The text names a place for each of them, ``ScalingYScalingFile="..."``; where the table really
     lies is filled in, again while a longer number has moved them.
     """
+    tables = tables or {}
     kind = next(number for number, dtype in PIXEL_TYPES.items() if dtype == pixels.dtype)
     own = text.encode()
     while True:

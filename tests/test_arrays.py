@@ -6,8 +6,6 @@ nothing. So would a graphics processor: whatever stays behind on the processor, 
 passing, ends in an error. What is fetched on purpose is counted.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from functools import partial

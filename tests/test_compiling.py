@@ -2,8 +2,6 @@
 keep it.
 """
 
-from __future__ import annotations
-
 import io
 import logging
 import os
@@ -97,7 +95,7 @@ cli.app = run
 sys.exit(cli.main([]))
 """
 
-    def run(self, folder, home, cache, *first: str) -> list[str]:
+    def run(self, folder, home, cache, *first):
         """Compile and run a loop by the program, in a process without other places for the cache;
         return the lines that it says.
         """
@@ -113,7 +111,7 @@ sys.exit(cli.main([]))
         assert done.returncode == 0, done.stderr
         return done.stderr.splitlines()
 
-    def assert_not_kept(self, said: list[str]) -> None:
+    def assert_not_kept(self, said):
         (line,) = said
         warning = "compiled loops cannot be kept, so every run compiles them again"
         assert line.startswith(f"tofclip: warning: {warning}")

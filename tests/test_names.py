@@ -2,8 +2,6 @@
 used, their docstrings' examples run and name every argument, and the exceptions make a tree.
 """
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import doctest
@@ -15,9 +13,7 @@ import re
 import subprocess
 import sys
 import typing
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -58,7 +54,7 @@ OF_METHODS = ("plan", "reconstruct")
 HEAVY = {"h5py", "matplotlib", "numba", "numpy", "open3d", "pyvista", "scipy", "tifffile"}
 
 
-def list_packages() -> Iterator[str]:
+def list_packages():
     for root in ROOTS:
         home = importlib.import_module(root)
         yield root
@@ -67,7 +63,7 @@ def list_packages() -> Iterator[str]:
                 yield item.name
 
 
-def show_signature(value: Any) -> str:
+def show_signature(value):
     """Names, kinds and defaults of arguments; types may be put more exactly."""
     plain, fields = inspect.signature(value), getattr(value, "__dataclass_fields__", {})
     shown = [one.replace(annotation=inspect.Parameter.empty) for one in plain.parameters.values()]
@@ -80,7 +76,7 @@ def show_signature(value: Any) -> str:
     return re.sub(r"<(?:function|class) '?([\w.]+)[^>]*>", r"\1", text)
 
 
-def list_members(name: str, home: type) -> Iterator[str]:
+def list_members(name, home):
     """A class's public methods and properties, inherited ones of this project included."""
     for one in OF_METHODS if hasattr(home, "reconstruct") else sorted(dir(home)):
         owner = next((base for base in home.__mro__ if one in vars(base)), object)
@@ -92,7 +88,7 @@ def list_members(name: str, home: type) -> Iterator[str]:
         yield f"{name}.{one}{show_signature(function) if is_method else ''}"
 
 
-def list_names() -> Iterator[str]:
+def list_names():
     """What every package exports, then the contract in full, and what else has measured defaults."""
     for package in list_packages():
         module = importlib.import_module(package)
@@ -108,7 +104,7 @@ def list_names() -> Iterator[str]:
             yield from list_members(name, value)
 
 
-def test_public_names_and_signatures_are_those_of_the_file() -> None:
+def test_public_names_and_signatures_are_those_of_the_file():
     made, kept = [*list_names()], GOLDEN.read_text("utf-8").splitlines()
     changed = [f"lost  {line}" for line in kept if line not in made]
     changed += [f"new   {line}" for line in made if line not in kept]
@@ -116,7 +112,7 @@ def test_public_names_and_signatures_are_those_of_the_file() -> None:
 
 
 @pytest.mark.parametrize("module", ROOTS)
-def test_a_list_of_names_shows_the_public_ones_only(module: str) -> None:
+def test_a_list_of_names_shows_the_public_ones_only(module):
     home = importlib.import_module(module)
     assert dir(home) == sorted(home.__all__)
     with pytest.raises(AttributeError, match="lidar_magic"):
@@ -131,7 +127,7 @@ def test_a_list_of_names_shows_the_public_ones_only(module: str) -> None:
         ("tofclip.io", {"numpy"}),
     ],
 )
-def test_importing_the_packages_imports_nothing_heavy(modules: str, light: set[str]) -> None:
+def test_importing_the_packages_imports_nothing_heavy(modules, light):
     code = f"import sys, {modules}; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
@@ -141,9 +137,9 @@ def test_importing_the_packages_imports_nothing_heavy(modules: str, light: set[s
     assert not (HEAVY - light) & loaded
 
 
-def public_names() -> dict[str, Any]:
+def public_names():
     """What packages list in ``__all__`` and what the pages of the API document, by full name."""
-    found: dict[str, Any] = {}
+    found = {}
     for package in list_packages():
         module = importlib.import_module(package)
         found |= {
@@ -164,9 +160,9 @@ def public_names() -> dict[str, Any]:
     return found
 
 
-def list_examples() -> Iterator[doctest.DocTest]:
+def list_examples():
     """Of all public names, each once: many are listed in several places."""
-    found: dict[tuple[str | None, int | None], doctest.DocTest] = {}
+    found = {}
     for name, value in public_names().items():
         if str(getattr(value, "__module__", "")).startswith(ROOTS):
             for test in doctest.DocTestFinder().find(value, name):
@@ -174,7 +170,7 @@ def list_examples() -> Iterator[doctest.DocTest]:
     yield from (test for test in found.values() if test.examples)
 
 
-def test_examples_do_what_they_say() -> None:
+def test_examples_do_what_they_say():
     """And of those that need a file of one's own, what they import and call is there."""
     tests = [*list_examples()]
     assert len(tests) > 10
@@ -192,7 +188,7 @@ def test_examples_do_what_they_say() -> None:
                     assert callable(eval(ast.unparse(node.func), test.globs)), test.name
 
 
-def list_signatures(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+def list_signatures(name, value):
     """The annotated things that a public name consists of: itself, and a class's public methods."""
     if inspect.isclass(value) or inspect.isfunction(value):
         yield name, value
@@ -205,7 +201,7 @@ def list_signatures(name: str, value: Any) -> Iterator[tuple[str, Any]]:
                 yield f"{name}.{own}", function
 
 
-def list_parts(annotation: Any) -> Iterator[Any]:
+def list_parts(annotation):
     """A type and all that it is made of."""
     yield annotation
     for part in typing.get_args(annotation):
@@ -216,7 +212,7 @@ def list_parts(annotation: Any) -> Iterator[Any]:
         )
 
 
-def list_signature_types(names: Mapping[str, Any]) -> Iterator[tuple[str, type]]:
+def list_signature_types(names):
     """Types of our own in the signatures of public names, each with the place where it stands."""
     # For annotations that are imported for the type checker only.
     by_name = {name.rpartition(".")[2]: value for name, value in names.items()}
@@ -233,7 +229,7 @@ def list_signature_types(names: Mapping[str, Any]) -> Iterator[tuple[str, type]]
                     yield where, one
 
 
-def test_every_type_in_a_public_signature_can_be_imported_from_a_public_place() -> None:
+def test_every_type_in_a_public_signature_can_be_imported_from_a_public_place():
     names = public_names()
     public = {id(value) for value in names.values()}
     found = [*list_signature_types(names)]
@@ -254,7 +250,7 @@ SECTION = re.compile(
 
 
 @pytest.fixture(scope="module")
-def public() -> dict[str, Any]:
+def public():
     """Public names by the place where they are defined."""
     packages, names = set(list_packages()), public_names()
     exported = {name: one for name, one in names.items() if name.rpartition(".")[0] in packages}
@@ -267,7 +263,7 @@ def public() -> dict[str, Any]:
     return {f"{one.__module__}.{one.__qualname__}": one for one in found}
 
 
-def list_docstrings() -> Iterator[tuple[str, str]]:
+def list_docstrings():
     """Every docstring with the full name that it belongs to."""
     for path in (
         path for package in (*ROOTS, "apps") for path in sorted((ROOT / package).rglob("*.py"))
@@ -276,7 +272,7 @@ def list_docstrings() -> Iterator[tuple[str, str]]:
         yield from walk(ast.parse(path.read_text("utf-8")), module)
 
 
-def walk(node: ast.AST, name: str) -> Iterator[tuple[str, str]]:
+def walk(node, name):
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     if isinstance(node, documented):
         yield name, ast.get_docstring(node) or ""
@@ -285,13 +281,13 @@ def walk(node: ast.AST, name: str) -> Iterator[tuple[str, str]]:
         yield from walk(child, own)
 
 
-def is_public(name: str, public: dict[str, Any]) -> bool:
+def is_public(name, public):
     """A public name, or a method of one that is not private."""
     home, _, own = name.rpartition(".")
     return name in public or (home in public and (own[0] != "_" or own.startswith("__")))
 
 
-def test_sections_stand_in_public_names_only(public: dict[str, Any]) -> None:
+def test_sections_stand_in_public_names_only(public):
     wrong = [
         name
         for name, text in list_docstrings()
@@ -303,7 +299,7 @@ def test_sections_stand_in_public_names_only(public: dict[str, Any]) -> None:
 BOUND = ("self", "cls")
 
 
-def list_undocumented(name: str, value: Any) -> Iterator[str]:
+def list_undocumented(name, value):
     """Arguments in no Parameters section and no sentence; a class describes its fields anywhere."""
     if inspect.isclass(value):
         described = inspect.getdoc(value) or ""
@@ -336,7 +332,7 @@ def list_undocumented(name: str, value: Any) -> Iterator[str]:
                 yield f"{name}{'.' * bool(own)}{own}({one})"
 
 
-def test_every_argument_of_a_public_name_is_in_its_docstring(public: dict[str, Any]) -> None:
+def test_every_argument_of_a_public_name_is_in_its_docstring(public):
     packages = set(list_packages())
     exported = [one for name, one in public_names().items() if name.rpartition(".")[0] in packages]
     missing = [
@@ -371,14 +367,14 @@ TREE = {
 }
 
 
-def test_the_tree_of_exceptions() -> None:
+def test_the_tree_of_exceptions():
     classes = {name: one for name, one in vars(errors).items() if inspect.isclass(one)}
     faults = {name: one for name, one in classes.items() if issubclass(one, Exception)}
     assert {name: fault.__bases__ for name, fault in faults.items()} == TREE
     assert all(name in errors.__doc__ for name in TREE)
 
 
-def test_messages_say_what_and_where() -> None:
+def test_messages_say_what_and_where():
     fault = errors.ShapeError("frames", (2, 3), (3, 2))
     assert str(fault) == "frames must have shape (2, 3), got (3, 2)"
     fault = errors.FileFormatError("shot.tif", "is empty")

@@ -1,7 +1,5 @@
 """Objects in the hand: opened by one function, printed in a line, shown in a notebook, sliced."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 

@@ -12,7 +12,6 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -73,18 +72,18 @@ def record():
     return Record("streak", {"counts": counts}, {"gain": 2.5, "name": "a"})
 
 
-def open_to_edit(record: Record, path: Path) -> h5py.File:
+def open_to_edit(record, path):
     record.save(path)
     return h5py.File(path, "r+", libver=("v110", "v110"))
 
 
-def assert_refused(path: Path, problem: str = r"a\.h5", *kinds: str) -> None:
+def assert_refused(path, problem=r"a\.h5", *kinds):
     with pytest.raises(FileFormatError, match=problem) as caught:
         Record.load(path, *kinds)
     assert "\n" not in str(caught.value)
 
 
-def assert_same(got: Record, expected: Record) -> None:
+def assert_same(got, expected):
     assert (got.kind, dict(got.attributes)) == (expected.kind, dict(expected.attributes))
     assert got.fields.keys() == expected.fields.keys()
     for name, entry in expected.fields.items():
@@ -174,7 +173,7 @@ class TestDamage:
     both.
     """
 
-    def damage(self, path: Path, positions) -> None:
+    def damage(self, path, positions):
         whole = path.read_bytes()
         for position in positions:
             damaged = bytearray(whole)

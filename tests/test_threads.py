@@ -1,7 +1,5 @@
 """Blocks and items on threads, and the threads of BLAS."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -122,7 +120,7 @@ class TestItems:
 
 
 class TestBlas:
-    def count(self) -> list[int]:
+    def count(self):
         libraries = [one for one in threadpool_info() if one["user_api"] == "blas"]
         return [library["num_threads"] for library in libraries]
 

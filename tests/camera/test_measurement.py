@@ -2,8 +2,6 @@
 of a point source whose geometry is known.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -27,16 +25,16 @@ WIDTH, ROWS = 61, 80
 TURN = np.array([[1.01, 0.02, -0.7], [-0.03, 0.98, 1.3], [1e-4, -2e-4, 1.0]])
 
 
-def camera(**changes: object) -> Camera:
+def camera(**changes):
     made = {"centres_px": [15.0, 45.0], "angles": [0.1, 0.2], "image_shape": (9, 9)}
     return Camera(**{**made, "slit_width_px": WIDTH, **changes})
 
 
-def skew(*offsets: float) -> SkewSweep:
+def skew(*offsets):
     return SkewSweep([15.0, 45.0], offsets, [0.0, 0.0])
 
 
-def streak(dark: float = 100.0) -> np.ndarray:
+def streak(dark=100.0):
     counts = np.full((ROWS, WIDTH), dark, np.float32)
     counts[30:50] += np.random.default_rng(0).random((20, WIDTH)).astype(np.float32) * 500
     return counts
@@ -119,7 +117,7 @@ def test_sweeps_are_undone_bilinearly_however_late_a_shot_is(sweep, delay):
     inside = (row >= 0) & (row <= ROWS - 1) & (column >= 0) & (column <= WIDTH - 1)
     inside[:, 20] = False
 
-    def sample(picture: np.ndarray) -> np.ndarray:
+    def sample(picture):
         return map_coordinates(picture.astype(float), [row, column], order=1, mode="nearest")
 
     expected = np.where(inside, sample(counts - 100.0), 0)
@@ -160,13 +158,13 @@ SKEW = SkewSweep(np.array([20.0, 55.0]), np.array([-6.0, 9.5]), np.array([0.01, 
 TURNED = ProjectiveSweep(TURN * [[1], [1], [0.1]] + np.diag([0, 0, 0.9]))
 
 
-def make_rectifier(sweep=SKEW) -> Rectifier:
+def make_rectifier(sweep=SKEW):
     dead = np.arange(SUM_WIDTH) == 20
     made = Camera([37.0], [0.0], (8, 8), SUM_WIDTH, sweep=sweep, dead_columns=dead)
     return Rectifier(made, LONG_ROWS)
 
 
-def long_streak(seed: int = 0) -> np.ndarray:
+def long_streak(seed=0):
     counts = np.random.default_rng(seed).poisson(90, (LONG_ROWS, SUM_WIDTH)).astype(np.float32)
     counts[60:130] += 300
     return counts
@@ -222,7 +220,7 @@ ANGLES = np.deg2rad([-42.0, -11.3, 0.4, 37.7])
 SHAPE, SLIT_ROW = (220, 660), 108
 
 
-def pictures(seed: int, noise: float = 5.0) -> list[np.ndarray]:
+def pictures(seed, noise=5.0):
     """Lines, their background, dots and theirs, as a camera with an offset and read noise takes
     them.
     """

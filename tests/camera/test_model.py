@@ -1,7 +1,5 @@
 """Cameras by hand: where points fall, sweeps, parallax, and their files."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
@@ -15,7 +13,6 @@ from tofclip.camera import (
     PolynomialSweep,
     ProjectiveSweep,
     SkewSweep,
-    Sweep,
 )
 from tofclip.camera.model import sweep_from_record
 from tofclip.camera.parallax import (
@@ -30,7 +27,7 @@ from tofclip.storage import Record
 CENTRES = [20.5, 50.0, 80.25]
 
 
-def camera(**changes: object) -> Camera:
+def camera(**changes):
     made = {"centres_px": CENTRES, "angles": [-0.5, 0.0, 0.5], "image_shape": (21, 25)}
     return Camera(**{**made, "slit_width_px": 101, **changes})
 
@@ -58,7 +55,7 @@ UNEVEN = Camera(
 
 @pytest.mark.parametrize("shear", [-2.5, -0.6, 0.0, 1.7])
 @pytest.mark.parametrize("view", range(7))
-def test_a_point_falls_where_the_convention_says(view: int, shear: float):
+def test_a_point_falls_where_the_convention_says(view, shear):
     """``x = X - Y tan(angle) + s u`` from the view's centre, of points all over the picture, and as
     bright as the view's gain.
     """
@@ -79,7 +76,7 @@ def test_a_point_falls_where_the_convention_says(view: int, shear: float):
 
 
 @pytest.mark.parametrize("rows", [40, 41])
-def test_no_shot_settles_the_sign_of_all_angles(rows: int) -> None:
+def test_no_shot_settles_the_sign_of_all_angles(rows):
     """With every sign turned round, the picture upside down explains any shot as well, however
     unequal the angles are and whatever the shear: nothing can be warned of.
     """
@@ -160,13 +157,13 @@ every_sweep = pytest.mark.parametrize("sweep", [SKEW, POLYNOMIAL, PROJECTIVE])
         (LEANING, (50, 30), (50 / 1.5, 30 / 1.5)),
     ],
 )
-def test_sweeps_by_hand(sweep: Sweep, rectified: tuple[float, float], raw: tuple[float, float]):
+def test_sweeps_by_hand(sweep, rectified, raw):
     found = sweep.raw_position(*np.array(rectified, float))
     assert tuple(map(float, found)) == pytest.approx(raw, abs=1e-12)
 
 
 @every_sweep
-def test_rows_and_columns_of_a_sweep_broadcast(sweep: Sweep) -> None:
+def test_rows_and_columns_of_a_sweep_broadcast(sweep):
     rows, columns = np.arange(5.0), np.linspace(0, 400, 7)
     grid = sweep.raw_position(rows[:, np.newaxis], columns[np.newaxis, :])
     for i, row in enumerate(rows):
@@ -218,7 +215,7 @@ def test_other_files_are_no_camera(tmp_path):
         (ProjectiveSweep, (np.eye(2),), r"\(3, 3\)"),
     ],
 )
-def test_numbers_that_describe_no_sweep_are_refused(kind, settings, message) -> None:
+def test_numbers_that_describe_no_sweep_are_refused(kind, settings, message):
     with pytest.raises(InputError, match=message):
         kind(*settings)
 

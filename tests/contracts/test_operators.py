@@ -4,10 +4,6 @@ it.
 On NumPy's arrays all of them, those that are portable on the arrays of other libraries as well.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import scipy.sparse
@@ -25,7 +21,6 @@ from tofclip.operators import (
     HadamardCodes,
     Identity,
     Integration,
-    LinearOperator,
     LinearShear,
     LineProjection,
     MaskedSensor,
@@ -47,25 +42,25 @@ CENTRES, ANGLES = [6.3, 19.0, 31.8], np.deg2rad([-41.0, 0.7, 35.0])
 VIEWS = [(-1, 0), (0, 2), (1, 1)]
 
 
-def draw(seed: int, *shape: int) -> np.ndarray:
+def draw(seed, *shape):
     return np.random.default_rng(seed).random(shape)
 
 
-def line_projection(dtype: type = np.float32) -> LinearOperator:
+def line_projection(dtype=np.float32):
     return LineProjection((11, 13), 37, CENTRES, ANGLES, [0.9, 1.0, 1.2], dtype)
 
 
-def sparse_matrix(dtype: type) -> LinearOperator:
+def sparse_matrix(dtype):
     random = np.random.default_rng(3)
     matrix = scipy.sparse.random_array((15, 21), density=0.2, rng=random, dtype=dtype)
     return SparseMatrix(matrix.tocsr(), (3, 7), (15,))
 
 
-def own_slits(dtype: type, extra: int) -> list[LinearOperator]:
+def own_slits(dtype, extra):
     return [LineProjection((5, 7), 9 + extra * k, [4.0], [0.1 * k], [1.0], dtype) for k in range(3)]
 
 
-def refocused_single_pixel(dtype: type) -> LinearOperator:
+def refocused_single_pixel(dtype):
     """The model of supplement Eq. 21: every view's codes after its shear, stacked and weighted."""
     codes = [
         HadamardCodes((11, 14), 5, k, dtype) @ LinearShear((11, 14), 0.4, view, (0, 0), dtype)
@@ -74,14 +69,14 @@ def refocused_single_pixel(dtype: type) -> LinearOperator:
     return MeanWeighting([5, 5], 0.1, dtype) @ Stack(codes)
 
 
-def spread_views(dtype: type) -> LinearOperator:
+def spread_views(dtype):
     """Views that add up on one sensor (supplement Eq. 19)."""
     return Integration(
         [PointSpreadConvolution((9, 7), spread, dtype=dtype) for spread in draw(10, 3, 4, 5)]
     )
 
 
-def hidden_to_wall(laser: object, dtype: type) -> LinearOperator:
+def hidden_to_wall(laser, dtype):
     """A hidden volume of odd sides, seen from a curved wall with a point missing."""
     x, y = np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.3, 0.3, 3))
     wall = np.stack([x, y, 0.1 * x**2 - 0.05 * y], axis=-1)
@@ -91,8 +86,7 @@ def hidden_to_wall(laser: object, dtype: type) -> LinearOperator:
     return WallModel(Hybrid(0.8, 4).plan(capture, grid), capture).operator()
 
 
-Build = Callable[[type], LinearOperator]
-PORTABLE: dict[str, Build] = {
+PORTABLE = {
     "line projection": line_projection,
     "sparse matrix": sparse_matrix,
     # too large for one cache tile, so that the product has to add up several
@@ -115,7 +109,7 @@ PORTABLE: dict[str, Build] = {
     "dense sensor": lambda t: DenseSensor((5, 7), t),
     "masked views": lambda t: MaskedViews(draw(12, 4, 5, 7), t),
 }
-BUILDERS: dict[str, Build] = PORTABLE | {
+BUILDERS = PORTABLE | {
     "view selection": lambda t: ViewSelection((5, 3, 4), [3, 0], t),
     # an odd and an even side: the Nyquist frequency exists on the even one only
     "linear shear": lambda t: LinearShear((11, 14), -0.7, (-4, 3), (0.3, -0.2), t),
@@ -160,23 +154,23 @@ in_every_type = pytest.mark.parametrize(
 )
 
 
-def put(library: str, *arrays: np.ndarray) -> tuple[object, ...]:
+def put(library, *arrays):
     """The same values as arrays of a library."""
     return tuple(find_device(library).put(array) for array in arrays)
 
 
-def fetched(library: str, array: object) -> np.ndarray:
+def fetched(library, array):
     """Values of a result, which has to be where the operand was."""
     assert ComputeDevice.of(array) == find_device(library)
     return to_numpy(array)
 
 
-def tolerance(dtype: type) -> float:
+def tolerance(dtype):
     """The project's bound for a matched adjoint: 1e-5 in float32, 1e-12 in float64."""
     return 1e-5 if dtype == np.float32 else 1e-12
 
 
-def random_pair(operator: LinearOperator, batch: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def random_pair(operator, batch):
     # Positive numbers: their products do not cancel, so that the relative bound means something.
     rng = np.random.default_rng(0)
     return rng.random((*operator.shape_in, *batch)), rng.random((*operator.shape_out, *batch))
@@ -189,9 +183,7 @@ def test_adjoint_matches_forward_and_both_have_the_stated_shape_and_type(build, 
         require_adjoint(operator, library, dtype, batch)
 
 
-def require_adjoint(
-    operator: LinearOperator, library: str, dtype: type, batch: tuple[int, ...]
-) -> None:
+def require_adjoint(operator, library, dtype, batch):
     x, y = random_pair(operator, batch)
     x_there, y_there = put(library, x.astype(dtype), y.astype(dtype))
     seen, back = fetched(library, operator(x_there)), fetched(library, operator.adjoint(y_there))

@@ -4,11 +4,8 @@ A kind is a function that takes a folder and returns the address of a source wit
 records, after which a live one is silent and any other at its end.
 """
 
-from __future__ import annotations
-
 import json
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +16,7 @@ from devices.emulation.scenes import simulate_line_light
 from devices.linospad2 import LinoSpad2Codec
 from devices.recorder import record_source
 from devices.recording.check import verify
-from devices.source import Batch, DecodedSource, Records, Source, as_bytes
+from devices.source import DecodedSource, as_bytes
 from devices.timetag import SendWindow
 from tofclip.errors import DeviceTimeoutError, InputError
 
@@ -50,11 +47,11 @@ def recorded(folder):
     return f"file://{path}"
 
 
-def record_until_quiet(source: Source, path: Path):
+def record_until_quiet(source, path):
     """Record all that a source has; a live one is stopped once it falls silent."""
     seen, asked = 0, 0
 
-    def stop_when_quiet(seconds: float):
+    def stop_when_quiet(seconds):
         nonlocal seen, asked
         stats = source.stats
         if stats.delivered + stats.malformed > seen:
@@ -127,7 +124,7 @@ def opened(address):
     return lambda: devices.open(address)
 
 
-def read_on(source: Source, batches: list[Batch]):
+def read_on(source, batches):
     """Read until nothing more comes: a live source is stopped once it falls silent, a paced replay
     is waited for.
     """
@@ -148,7 +145,7 @@ def read_on(source: Source, batches: list[Batch]):
         batches.append(batch)
 
 
-def joined(batches: list[Batch]) -> Records:
+def joined(batches):
     return np.concatenate([batch.records for batch in batches])
 
 
@@ -260,7 +257,7 @@ def test_seeking_is_exact_or_refused(opened):
 
 
 def test_the_same_again_is_the_same(opened):
-    runs: list[list[Batch]] = [[], []]
+    runs = [[], []]
     for batches in runs:
         with opened() as source:
             read_on(source, batches)
@@ -273,7 +270,7 @@ def test_its_bytes_are_tapped_before_they_are_decoded(opened, tmp_path):
     with opened() as source:
         if not isinstance(source, DecodedSource):
             return
-        tapped: list[bytes] = []
+        tapped = []
         source.tap = lambda piece: tapped.append(piece.data)
         batch = source.read(LONG)
         assert batch is not None

@@ -1,15 +1,8 @@
 """Files as the instruments write them, small and with known content."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import tifffile
-from numpy.typing import NDArray
 
 HPDTA_TEXT = (
     '[Application],Enconding=UTF-8,Date="5/2/2021",Software="HPD-TA",ApplicationTitle="High Performance, Digital"\r\n'
@@ -22,29 +15,22 @@ HPDTA_TEXT = (
     'ScalingYScalingFile="{place}"[Comment],UserComment=""'
 )
 
-Write = Callable[..., Path]
-
 
 @pytest.fixture
-def pixels() -> NDArray[np.uint16]:
+def pixels():
     """Raw counts above the camera's offset of 100."""
     return np.random.default_rng(5).integers(100, 4000, (20, 30)).astype(np.uint16)
 
 
 @pytest.fixture
-def write_hpdta(tmp_path: Path, pixels: NDArray[np.uint16]) -> Write:
+def write_hpdta(tmp_path, pixels):
     """Write an HPD-TA TIFF, its table of times (in `unit`) behind everything else."""
 
-    def write(
-        table: NDArray[Any] | None = None,
-        place: str = "",
-        picture: NDArray[Any] = pixels,
-        **text: object,
-    ) -> Path:
+    def write(table=None, place="", picture=pixels, **text):
         path = tmp_path / "shot.tif"
         entries = {"bits": 16, "exposures": 1, "top": 0, "kind": 2, "scale": 1, "unit": "ns"} | text
 
-        def save(place: str) -> None:
+        def save(place):
             description = HPDTA_TEXT.format(place=place, **entries)
             tifffile.imwrite(
                 path,
@@ -69,7 +55,7 @@ def write_hpdta(tmp_path: Path, pixels: NDArray[np.uint16]) -> Write:
 
 
 @pytest.fixture
-def lift_entries() -> dict[str, Any]:
+def lift_entries():
     """Entries of a non-line-of-sight archive with three views; the wall is seen by a pinhole of 250
     px.
     """
@@ -97,10 +83,10 @@ def lift_entries() -> dict[str, Any]:
 
 
 @pytest.fixture
-def write_lift(tmp_path: Path, lift_entries: dict[str, Any]) -> Write:
+def write_lift(tmp_path, lift_entries):
     """Write a LIFT archive; keywords replace its entries, None leaves one out."""
 
-    def write(**changes: Any) -> Path:
+    def write(**changes):
         path = tmp_path / "shot.npz"
         np.savez_compressed(
             path, **{k: v for k, v in (lift_entries | changes).items() if v is not None}

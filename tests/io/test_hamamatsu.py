@@ -166,7 +166,7 @@ def test_pictures_of_every_type_are_read_whatever_tables_they_have(data):
 
 
 @pytest.fixture
-def image() -> bytes:
+def image():
     """Six rows of four pixels with a slowing sweep, exact in float32."""
     pixels, times = np.arange(24, dtype="<u2").reshape(6, 4), np.array([0, 1, 2.25, 3.5, 5, 6.5])
     tables = {"X": np.arange(4, 0, -1.0), "Y": times.astype(np.float32)}

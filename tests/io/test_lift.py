@@ -229,7 +229,7 @@ def test_recorded_pulse_in_a_fibre_agrees_between_views_once_rectified(shared_da
     disagreement = np.eye(7) - views @ np.linalg.pinv(views)
     window = np.arange(-90, 91)
 
-    def median_error_px(rectified: bool) -> float:
+    def median_error_px(rectified):
         column = camera.centres_px[:, np.newaxis] + window
         errors = []
         for row in rows:

@@ -15,7 +15,7 @@ from tofclip.light_field import LightField
 VIEWS = np.array([(v, u) for v in (-1.0, 0.0) for u in (-1.0, 0.0, 1.5)])
 
 
-def light_field() -> LightField:
+def light_field():
     return LightField(np.random.default_rng(4).random((6, 9, 14), np.float32), VIEWS)
 
 
@@ -50,7 +50,7 @@ def test_colour_parts_become_luminance(tmp_path):
     np.testing.assert_allclose(found.pictures[0], rgb @ [0.2125, 0.7154, 0.0721], rtol=1e-5)
 
 
-def pictures(rows: int, columns: int):
+def pictures(rows, columns):
     """Each view is known by one bright pixel."""
     made = np.zeros((rows, columns, 8, 10), np.uint8)
     for v, u in np.ndindex(rows, columns):

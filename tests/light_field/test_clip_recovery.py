@@ -2,8 +2,6 @@
 pictures of two depths whose nearer surface hides a part of the farther one.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +11,6 @@ from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import LightField
 from tofclip.light_field.views import (
     CameraSetup,
-    ClipMeasurement,
     corrupt_measurement,
     find_view_labels,
     make_view_warp,
@@ -35,26 +32,24 @@ VIEWS = np.array([(v, u) for v in range(-2, 2) for u in range(-2, 2)], float)
 Y, X = np.mgrid[:SIDE, :SIDE].astype(float)
 
 
-def frame_and_bar(v: float, u: float) -> np.ndarray:
+def frame_and_bar(v, u):
     right, down = np.abs(X - SHEAR * u - 24), np.abs(Y - SHEAR * v - 24)
     far = np.maximum(right, down)
     return 0.05 + 0.9 * ((far < 16) & (far >= 11)) + 0.6 * ((right < 3) & (down < 9))
 
 
 @pytest.fixture(scope="module")
-def scene() -> LightField:
+def scene():
     """A frame and a bar at one depth, seen by 4 x 4 views of 48 x 48 pixels."""
     return LightField(np.stack([frame_and_bar(v, u) for v, u in VIEWS]).astype(np.float32), VIEWS)
 
 
 @pytest.fixture(scope="module")
-def truth(scene) -> np.ndarray:
+def truth(scene):
     return scene.refocus(SHEAR)
 
 
-def encode(
-    scene: LightField, encoder: str = "line", ratio: float = 1.0, seed: int = 0
-) -> ClipMeasurement:
+def encode(scene, encoder="line", ratio=1.0, seed=0):
     return measure(scene, CameraSetup(encoder, ratio, seed))
 
 
@@ -112,7 +107,7 @@ def test_the_likelihood_of_photons_does_about_as_well_as_squares(scene, truth):
     at times better.
     """
 
-    def mean_error(name: str) -> float:
+    def mean_error(name):
         counted = [
             corrupt_measurement(encode(scene, "line", 2.0, seed), 60, 0) for seed in range(3)
         ]
@@ -177,7 +172,7 @@ def test_views_without_readings_are_filled_in(scene):
 NEAR, FAR = -1.0, 0.5
 
 
-def draw_view(v: float, u: float) -> tuple[np.ndarray, np.ndarray]:
+def draw_view(v, u):
     """A near frame before far stripes, and where the frame is."""
     right, down = np.abs(X - NEAR * u - 22), np.abs(Y - NEAR * v - 25)
     frame = (np.maximum(right, down) < 14) & (np.maximum(right, down) >= 8)
@@ -191,12 +186,12 @@ SHEARS = np.array([NEAR, FAR])
 
 
 @pytest.fixture(scope="module")
-def layers() -> LightField:
+def layers():
     return LightField(np.stack([draw_view(v, u)[0] for v, u in VIEWS]).astype(np.float32), VIEWS)
 
 
 @pytest.fixture(scope="module")
-def measurement(layers) -> ClipMeasurement:
+def measurement(layers):
     return encode(layers, "line-even")
 
 

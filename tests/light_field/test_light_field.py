@@ -2,8 +2,6 @@
 and depth from focus.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -52,12 +50,12 @@ HEAD_ON = (0.0, 0.0, -1.0)
 PLAIN = make_plain_pattern(0.5)
 
 
-def plate(shear: float, pattern: np.ndarray, size: float = 0.3) -> Body:
+def plate(shear, pattern, size=0.3):
     place = np.array([0.0, 0.0, ARRAY.depth(shear)])
     return Body(Rectangle(size, size), Lambertian(pattern), place)
 
 
-def look(*bodies: Body, lamp=HEAD_ON, array: CameraArray = ARRAY) -> np.ndarray:
+def look(*bodies, lamp=HEAD_ON, array=ARRAY):
     return render_view(Scene(bodies, lamp), array, (0.0, 0.0))
 
 
@@ -122,7 +120,7 @@ def test_only_a_glossy_ball_looks_different_from_other_sides():
     (supplement Note 1).
     """
 
-    def change(material: Lambertian) -> float:
+    def change(material):
         body = Body(Sphere(0.2), material, np.array([0.0, 0.0, 1.2]))
         seen = []
         for origin in (np.zeros(3), np.array([0.3, 0, 0])):
@@ -181,7 +179,7 @@ MOVED = [np.roll(CARD, (int(SHEAR * v), int(SHEAR * u)), (0, 1)) for v, u in VIE
 LIGHT_FIELD = LightField(np.stack(MOVED), VIEWS)
 
 
-def encode(encoder: str = "line", ratio: float = 1.0, seed: int = 0) -> ClipMeasurement:
+def encode(encoder="line", ratio=1.0, seed=0):
     return measure(LIGHT_FIELD, CameraSetup(encoder, ratio, seed))
 
 

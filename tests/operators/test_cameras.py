@@ -2,8 +2,6 @@
 measurements they take and which views get them, that their two models agree, and their norm.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -43,7 +41,7 @@ from tofclip.operators.convolution import (
 from tofclip.solvers.fista import NORM_MARGIN
 
 
-def make_views(rows: range, columns: range) -> list[tuple[float, float]]:
+def make_views(rows, columns):
     return [(float(v), float(u)) for v in rows for u in columns]
 
 
@@ -56,7 +54,7 @@ every_camera = pytest.mark.parametrize("name", CAMERAS)
 every_mask = pytest.mark.parametrize("name", COMPRESSIVE_CAMERAS)
 
 
-def spread_at(element, shear: float) -> np.ndarray:
+def spread_at(element, shear):
     spreads = trace_view_point_spreads(element, GRID, PLANE)
     return shear_point_spreads(spreads, GRID, shear).sum(axis=0)
 
@@ -80,7 +78,7 @@ def test_a_coded_aperture_s_spread_is_its_code_mirrored_and_scaled_by_the_shear(
 def test_a_cubic_phase_plate_s_spread_hardly_changes_with_depth():
     """Against an open aperture, whose PSF grows with s: the likeness of two depths' PSFs."""
 
-    def similarity(element) -> float:
+    def similarity(element):
         near, far = (np.abs(np.fft.fft2(spread_at(element, s))) for s in (0.0, 0.7))
         return float(np.vdot(near, far) / np.linalg.norm(near) / np.linalg.norm(far))
 
@@ -157,7 +155,7 @@ def test_measurements_that_cannot_be_used_are_refused(stack, shears, message):
         MeasuredPointSpreads(stack, shears)
 
 
-def blob(y: float = 24.0, x: float = 29.0) -> np.ndarray:
+def blob(y=24.0, x=29.0):
     """A spot that no shear or PSF of these cameras brings near a border, and smooth enough for
     interpolation.
     """
@@ -267,7 +265,7 @@ def test_every_camera_refocuses_the_letters(name, weight, worst, shared_data):
     weighting = camera.weighting()
     method = TotalVariation(weight, 300, 1e-4)
 
-    def error(shear: float) -> float:
+    def error(shear):
         found = method.recover(weighting @ camera.model(shear), weighting(measurements)[:, None])
         return nmse(found.frames[0], letters.refocus(-0.3), 12)
 
@@ -275,7 +273,7 @@ def test_every_camera_refocuses_the_letters(name, weight, worst, shared_data):
     assert error(1.2) > 2 * error(-0.3)
 
 
-def assign(even: bool, angles: np.ndarray, seed: int, cycle: int = 4):
+def assign(even, angles, seed, cycle=4):
     """The views that have angles, and each angle's view."""
     random = np.random.default_rng(seed)
     used, dealt = (
@@ -305,7 +303,7 @@ def test_neighbouring_angles_stand_for_the_whole_aperture(count, cycle):
     """
     angles = np.arange(count) * np.pi / count
 
-    def unevenness(even: bool, seed: int) -> float:
+    def unevenness(even, seed):
         v, u = np.array(GRID)[assign(even, angles, seed, cycle)[1]].T
         offset = (u + 0.5) * np.cos(angles) + (v + 0.5) * np.sin(angles)
         return float(np.sqrt(np.mean(np.convolve(offset, np.ones(cycle) / cycle, "valid") ** 2)))

@@ -2,8 +2,6 @@
 contract of operators.
 """
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np
@@ -36,21 +34,21 @@ from tofclip.operators.sparse import make_product
 sizes = st.integers(1, 9)
 
 
-def draw(seed: int, *shape: int) -> np.ndarray:
+def draw(seed, *shape):
     return np.random.default_rng(seed).random(shape)
 
 
-def centroid(slit: np.ndarray) -> float:
+def centroid(slit):
     return float(np.sum(slit * np.arange(slit.size)) / np.sum(slit))
 
 
-def point(shape: tuple[int, int], x: int, y: int) -> np.ndarray:
+def point(shape, x, y):
     picture = np.zeros(shape)
     picture[shape[0] // 2 + y, shape[1] // 2 + x] = 1
     return picture
 
 
-def lines(shape: tuple[int, int], slit: int, *views: tuple[float, float, float]) -> LineProjection:
+def lines(shape, slit, *views):
     """Views as (centre, angle, gain)."""
     return LineProjection(shape, slit, *zip(*views, strict=True), np.float64)
 

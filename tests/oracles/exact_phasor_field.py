@@ -1,20 +1,17 @@
 """The definition of the phasor-field image, summed term by term in float64: what methods answer to."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-from nlos.band import Band, VirtualPulse
-from nlos.capture import Capture, TimeAxis
+from nlos.band import Band
+from nlos.capture import TimeAxis
 from nlos.method import require_imageable
-from nlos.volume import Grid, Volume
+from nlos.volume import Volume
 
 TERMS_PER_BLOCK = 1 << 15
 """Distances held at a time, so that what is computed of them stays in the processor's cache."""
 
 
-def compute_exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Volume:
+def compute_exact_phasor_field(capture, grid, pulse):
     """Sum ``P_k(r_p) * exp(1j * k * (|r_L - r| + |r - r_p|)) / |r - r_p|`` over the band and the
     wall.
 
@@ -34,7 +31,7 @@ def compute_exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse
     return Volume(field.reshape(grid.shape), grid, capture.provenance)
 
 
-def follow_by_silence(capture: Capture, grid: Grid) -> TimeAxis:
+def follow_by_silence(capture, grid):
     """The record's axis and twice as much again, beyond every path: evenly spaced frequencies repeat a
     record with their period, and what was not recorded is dark.
     """
@@ -45,12 +42,7 @@ def follow_by_silence(capture: Capture, grid: Grid) -> TimeAxis:
     return TimeAxis(2 * bins, capture.axis.bin_width, capture.axis.start)
 
 
-def _sum_over_wall(
-    capture: Capture,
-    voxels: NDArray[np.float64],
-    wavenumbers: NDArray[np.float64],
-    phasors: NDArray[np.complex128],
-) -> NDArray[np.complex128]:
+def _sum_over_wall(capture, voxels, wavenumbers, phasors):
     last_leg = np.linalg.norm(voxels[:, np.newaxis] - capture.points, axis=-1)
     path = last_leg + np.linalg.norm(voxels[:, np.newaxis] - capture.lasers, axis=-1)
     step = np.diff(wavenumbers).mean()

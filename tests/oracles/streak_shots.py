@@ -36,14 +36,14 @@ class Scene:
     reflectance: np.ndarray
 
     @property
-    def pixel_range(self) -> np.ndarray:
+    def pixel_range(self):
         """Median range of each pixel whose points all lie on one surface; NaN elsewhere."""
         points = _by_pixel(self.distance)
         spread = points.max(axis=-1) - points.min(axis=-1)
         return np.where(spread < 0.02, np.median(points, axis=-1), np.nan)
 
     @property
-    def nearby_ranges(self) -> np.ndarray:
+    def nearby_ranges(self):
         """Ranges of all points within a pixel, (64, 64, n): what a true return may show."""
         padded = np.pad(self.distance, SIDE, constant_values=np.nan)
         side = 3 * SIDE
@@ -51,7 +51,7 @@ class Scene:
         return windows.reshape(PICTURE, PICTURE, side * side)
 
 
-def make_room(wall: float = 0.3) -> Scene:
+def make_room(wall=0.3):
     """A wall at 2.0 m, a tilted board, a ball and a bar in front of it."""
     place = (np.arange(PICTURE * SIDE) + 0.5) / SIDE - 0.5 - PICTURE // 2
     y, x = np.meshgrid(place, place, indexing="ij")
@@ -67,7 +67,7 @@ def make_room(wall: float = 0.3) -> Scene:
     return Scene(distance, reflectance)
 
 
-def make_steps(wall: float = 0.25) -> Scene:
+def make_steps(wall=0.25):
     """A slanted wall, two steps, a disc and thin poles: no threshold was set on them."""
     place = (np.arange(PICTURE * SIDE) + 0.5) / SIDE - 0.5 - PICTURE // 2
     y, x = np.meshgrid(place, place, indexing="ij")
@@ -85,9 +85,7 @@ def make_steps(wall: float = 0.25) -> Scene:
     return Scene(distance, reflectance)
 
 
-def add_retroreflector(
-    scene: Scene, brightness: float = 40.0, corner: tuple[int, int] = (-22, -22)
-) -> Scene:
+def add_retroreflector(scene, brightness=40.0, corner=(-22, -22)):
     """Two by two pixels that send back far more than anything else."""
     reflectance = scene.reflectance.copy()
     y, x = ((PICTURE // 2 + place) * SIDE for place in corner)
@@ -95,7 +93,7 @@ def add_retroreflector(
     return Scene(scene.distance, reflectance)
 
 
-def compute_light(scene: Scene) -> np.ndarray:
+def compute_light(scene):
     """Expected light of each row and column, (240, 602), for reflectance 1 at 1 m and a pixel."""
     place = (np.arange(PICTURE * SIDE) + 0.5) / SIDE - 0.5 - PICTURE // 2
     y, x = (axis.ravel() for axis in np.meshgrid(place, place, indexing="ij"))
@@ -120,36 +118,34 @@ def compute_light(scene: Scene) -> np.ndarray:
     return light[12:-12]
 
 
-def _skew(column: np.ndarray) -> np.ndarray:
+def _skew(column):
     """Rows by which the sweep is late: known at the views' centres, straight between and beyond."""
     part = np.clip(np.searchsorted(CENTRES, column) - 1, 0, CENTRES.size - 2)
     rise = np.diff(LATE_ROWS) / np.diff(CENTRES)
     return LATE_ROWS[part] + rise[part] * (column - CENTRES[part])
 
 
-def count_photons(
-    light: np.ndarray, peak: float = 2000.0, background: float = 2.0, seed: int = 0
-) -> np.ndarray:
+def count_photons(light, peak=2000.0, background=2.0, seed=0):
     """Photons of one shot whose brightest pixel expects `peak` of signal."""
     noise = np.random.default_rng(seed)
     return noise.poisson(light * (peak / light.max()) + background).astype(np.float32)
 
 
-def add_afterglow(light: np.ndarray, fraction: float = 0.15, rows: float = 12.0) -> np.ndarray:
+def add_afterglow(light, fraction=0.15, rows=12.0):
     """A screen that gives a part of its light back later, exponentially."""
     fading = np.exp(-np.arange(ROWS) / rows)
     late = np.apply_along_axis(lambda column: np.convolve(column, fading)[:ROWS], 0, light)
     return (1 - fraction) * light + fraction * late / fading.sum()
 
 
-def add_hot_pixels(counts: np.ndarray, number: int, seed: int = 0) -> np.ndarray:
+def add_hot_pixels(counts, number, seed=0):
     """Pixels thirty times as bright as the brightest."""
     noise, hot = np.random.default_rng(seed), counts.copy()
     hot[noise.integers(2, ROWS - 2, number), noise.integers(0, SLIT, number)] = 30 * counts.max()
     return hot
 
 
-def add_tracks(counts: np.ndarray, number: int, seed: int = 0) -> np.ndarray:
+def add_tracks(counts, number, seed=0):
     """Straight traces of particles, 4 to 15 pixels long."""
     noise, struck = np.random.default_rng(seed), counts.copy()
     for _ in range(number):
@@ -161,12 +157,12 @@ def add_tracks(counts: np.ndarray, number: int, seed: int = 0) -> np.ndarray:
     return struck
 
 
-def _by_pixel(points: np.ndarray) -> np.ndarray:
+def _by_pixel(points):
     cells = points.reshape(PICTURE, SIDE, PICTURE, SIDE).transpose(0, 2, 1, 3)
     return cells.reshape(PICTURE, PICTURE, SIDE * SIDE)
 
 
-def score(y, x, distance, scene: Scene, tolerance_m: float = 0.009) -> tuple[float, float]:
+def score(y, x, distance, scene, tolerance_m=0.009):
     """Fractions of the pixels that are missed, and of the returns that are false.
 
     A return is true if some point of the scene within a pixel of it is as far away, to the pulse's

@@ -3,8 +3,6 @@ range; and shadows on a wall, which come out as holes in its part of the cloud, 
 Supplementary Figure 22: letters in front of a wall, lit from the side by a round, uneven beam.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -36,7 +34,6 @@ from tofclip.simulate import (
     render_true_frames,
     simulate_shot,
 )
-from tofclip.simulate.bodies import Body
 from tofclip.simulate.demo import FOCAL_LENGTH_PX
 from tofclip.simulate.patterns import TEXELS, cut_pattern, make_letter, make_plain_pattern
 from tofclip.solvers import Backprojection, Sparse, TotalVariation
@@ -51,7 +48,7 @@ CENTRES = 60.0 + 90 * np.arange(7)
 METHOD = Sparse(iterations=40)
 
 
-def camera(order: tuple[int, ...] = (3, 0, 5, 1, 6, 2, 4)) -> Camera:
+def camera(order=(3, 0, 5, 1, 6, 2, 4)):
     """Seven views, their angles by default in an order that makes ranges defocus."""
     return Camera(
         CENTRES,
@@ -66,13 +63,13 @@ def camera(order: tuple[int, ...] = (3, 0, 5, 1, 6, 2, 4)) -> Camera:
     )
 
 
-def make_facing_plate(pattern, place_px, side_px: float, distance: float, focal=FOCAL) -> Body:
+def make_facing_plate(pattern, place_px, side_px, distance, focal=FOCAL):
     """So many pixels large and aside, seen from the reference view."""
     x, y, side = (number * distance / focal for number in (*place_px, side_px))
     return make_plate((x, y, distance), (side, side), pattern)
 
 
-def letter(name: str, brightness: float) -> np.ndarray:
+def letter(name, brightness):
     return cut_pattern(make_letter(name), make_plain_pattern(brightness))
 
 
@@ -84,11 +81,11 @@ SCENE = Scene(
 )
 
 
-def instrument(made: Camera) -> Instrument:
+def instrument(made):
     return Instrument(made, StreakDetector(1560, BIN, peak_photons=2e5, full_scale_photons=1e9))
 
 
-def gate(distance: float, made: Camera) -> slice:
+def gate(distance, made):
     row = round((2 * distance / SPEED_OF_LIGHT + made.time_zero) / BIN)
     return slice(row - 4, row + 9)
 
@@ -99,7 +96,7 @@ def shot():
 
 
 @pytest.fixture(scope="module")
-def locked(shot) -> Frames:
+def locked(shot):
     return recover(shot.streak, shot.camera, METHOD, focus=DepthLockedFocus())
 
 
@@ -109,10 +106,10 @@ def test_every_range_is_as_good_as_alone_and_the_ends_are_better_than_any_fixed_
     measurements = measure(shot.streak.counts, None, made).values
     shears = np.linspace(-2.0, 0.5, 6)
 
-    def error(frames: np.ndarray, distance: float) -> float:
+    def error(frames, distance):
         return nmse(frames.sum(axis=0), truth[gate(distance, made)].sum(axis=0))
 
-    def alone(distance: float, shear: float) -> float:
+    def alone(distance, shear):
         part = np.ascontiguousarray(measurements[:, gate(distance, made)])
         return error(METHOD.recover(made.operator(shear), part).frames, distance)
 
@@ -241,7 +238,7 @@ LETTERS = (("U", (-22, -18), 2.2), ("L", (24, -14), 2.35), ("C", (2, 22), 2.25))
 LETTER_SIDE_PX = 30
 
 
-def make_shadow_scene() -> Scene:
+def make_shadow_scene():
     """Three letters between 2.2 and 2.35 m, a wall at 2.8 m, a lamp 0.17 m up and to the left.
 
     The beam's profile is printed on the wall, where it matters; the letters are evenly bright.
@@ -255,7 +252,7 @@ def make_shadow_scene() -> Scene:
     return Scene(bodies, LAMP_POSITION_M)
 
 
-def find_lit_and_shadow() -> list[np.ndarray]:
+def find_lit_and_shadow():
     """Pixels whose whole neighbourhood is lit wall, or wall in shadow, by the ray caster."""
     scene, made = make_shadow_scene(), make_default_instrument().camera
     rows, columns = np.indices(made.image_shape).reshape(2, -1)

@@ -2,8 +2,6 @@
 recovery had no part in, the camera found from the shot, and how a shot is opened and a plan made.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 
@@ -11,7 +9,7 @@ import numpy as np
 import pytest
 from three_view_shot import CAMERA, make_streak
 
-from tofclip import Frames, Streak, depth, point_cloud, recover
+from tofclip import Streak, depth, point_cloud, recover
 from tofclip.camera import Camera, ProjectiveSweep, measure
 from tofclip.camera.registration import estimate_skew, register_views
 from tofclip.errors import CalibrationError, InputError, MissingTimeAxisError, ShapeError
@@ -25,7 +23,6 @@ from tofclip.recovery import (
 )
 from tofclip.recovery import shot as opening
 from tofclip.simulate import (
-    SimulatedShot,
     make_default_instrument,
     make_default_scene,
     render_true_frames,
@@ -40,23 +37,23 @@ BIN_M = SPEED_OF_LIGHT * 20e-12 / 2
 
 
 @pytest.fixture(scope="module")
-def shot() -> SimulatedShot:
+def shot():
     return simulate_shot(make_default_scene(), make_default_instrument(), seed=0)
 
 
 @pytest.fixture(scope="module")
-def true_frames(shot) -> Frames:
+def true_frames(shot):
     return render_true_frames(make_default_scene(), make_default_instrument(), shot.exposure)
 
 
 @pytest.fixture(scope="module")
-def uncalibrated(shot) -> Camera:
+def uncalibrated(shot):
     """The camera as focus pictures would give it: no sweep, no gains, no parallax."""
     return shot.camera.replace(sweep=None, gains=np.ones(7), lenslet_pitch=0.0)
 
 
 @pytest.fixture(scope="module")
-def frames(shot, uncalibrated) -> Frames:
+def frames(shot, uncalibrated):
     return recover(shot.streak, uncalibrated, "l1")
 
 
@@ -134,7 +131,7 @@ def test_photon_noise_leaves_the_depth_far_below_half_a_bin(shot, true_frames):
 def test_the_score_tells_right_from_wrong(shot, true_frames):
     returns, truth = depth(true_frames), shot.truth
 
-    def score(values: np.ndarray) -> dict[str, float]:
+    def score(values):
         return score_returns(depth(replace(true_frames, values=values)), truth)
 
     shifted = score_returns(replace(returns, range=returns.range + 1.2 * BIN_M), truth)
@@ -230,7 +227,7 @@ def test_progress_adds_up(shot, uncalibrated):
     counts, times = shot.streak.counts[:330], shot.streak.times[:330]
     few_rows = replace(shot.streak, counts=counts, row_times=times, saturated=None)
     for camera in (shot.camera, uncalibrated):
-        done: list[int] = []
+        done = []
         plan = plan_recovery(open_shot(few_rows, camera), LinearInverse())
         plan.run(done.append)
         assert 0 < sum(done) <= plan.work
@@ -264,7 +261,7 @@ OTHER = CAMERA.replace(gains=np.array([1.0, 2.0, 1.0]))
 
 
 @pytest.fixture
-def streak() -> Streak:
+def streak():
     return make_streak()
 
 
@@ -345,7 +342,7 @@ def test_a_method_can_be_named():
 
 def test_a_plan_knows_its_work_and_its_memory(streak):
     plan = plan_recovery(open_shot(streak), "linear", FixedFocus(0.5))
-    done: list[int] = []
+    done = []
     frames = plan.run(done.append)
     assert sum(done) == plan.work == 12
     assert plan.memory_bytes == frames.values.nbytes + 90 * 12 * (4 + 1)

@@ -2,8 +2,6 @@
 simulated ones whose hot pixels, traces of particles and dead columns are found, masked and without effect.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +12,10 @@ from three_view_shot import CAMERA
 from tofclip.camera import Camera, SkewSweep
 from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
-from tofclip.lidar import Returns, depth
+from tofclip.lidar import depth
 from tofclip.recovery import make_method, open_shot, plan_recovery, recover
 from tofclip.recovery.defects import estimate_noise, find_clipping_level, find_defects
-from tofclip.shots import Frames, Streak
+from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.demo import make_default_camera
 from tofclip.simulate.patterns import make_plain_pattern
@@ -36,12 +34,12 @@ ORACLE_CAMERA = Camera(
 )
 
 
-def recover_frames(counts: np.ndarray, method: str, iterations: int | None = None) -> Frames:
+def recover_frames(counts, method, iterations=None):
     streak = Streak(counts, np.arange(oracle.ROWS) * oracle.ROW_S, camera=ORACLE_CAMERA)
     return plan_recovery(open_shot(streak), make_method(method, iterations=iterations)).run()
 
 
-def compute_range_z(returns: Returns, scene: oracle.Scene) -> float:
+def compute_range_z(returns, scene):
     """Robust z-score of the returns that are of their pixel's surface."""
     error = returns.range - scene.pixel_range[returns.y, returns.x]
     own = np.abs(error) < 0.03
@@ -49,12 +47,12 @@ def compute_range_z(returns: Returns, scene: oracle.Scene) -> float:
 
 
 @pytest.fixture(scope="module")
-def room() -> oracle.Scene:
+def room():
     return oracle.make_room()
 
 
 @pytest.fixture(scope="module")
-def light(room) -> np.ndarray:
+def light(room):
     return oracle.compute_light(room)
 
 
@@ -74,7 +72,7 @@ EXPECTED = {
 SLOW = pytest.mark.nightly
 
 
-def take_shot(kind: str, room: oracle.Scene, light: np.ndarray) -> tuple[oracle.Scene, np.ndarray]:
+def take_shot(kind, room, light):
     """Scene and counts. The image is a fifth of a whole one, so defects are five times as dense."""
     if kind == "retroreflector":
         scene = oracle.add_retroreflector(oracle.make_room(RETRO_WALL))
@@ -86,7 +84,7 @@ def take_shot(kind: str, room: oracle.Scene, light: np.ndarray) -> tuple[oracle.
     return room, spoil(kind, oracle.count_photons(light, 20.0 if kind == "dark" else 2000.0))
 
 
-def spoil(kind: str, counts: np.ndarray) -> np.ndarray:
+def spoil(kind, counts):
     """What goes wrong in the camera."""
     if kind == "one hot pixel":
         return oracle.add_hot_pixels(counts, 1)
@@ -102,7 +100,7 @@ def spoil(kind: str, counts: np.ndarray) -> np.ndarray:
     return spoilt
 
 
-def check_returns(kind: str, method: str, scene: oracle.Scene, counts: np.ndarray) -> None:
+def check_returns(kind, method, scene, counts):
     returns = depth(recover_frames(counts, method))
     missed, false = oracle.score(returns.y, returns.x, returns.range, scene)
     assert missed <= EXPECTED[kind][0]
@@ -123,7 +121,7 @@ FAST |= {("retroreflector", "l1"), ("clipped", "tv")}
         for method in ("tv", "l1")
     ],
 )
-def test_returns_are_found_and_few_are_false(room, light, kind, method) -> None:
+def test_returns_are_found_and_few_are_false(room, light, kind, method):
     check_returns(kind, method, *take_shot(kind, room, light))
 
 
@@ -139,7 +137,7 @@ def test_returns_are_found_and_few_are_false(room, light, kind, method) -> None:
         ),
     ],
 )
-def test_another_scene(kind, method) -> None:
+def test_another_scene(kind, method):
     steps, dark = oracle.make_steps(), kind == "dark"
     light = oracle.compute_light(steps)
     counts = oracle.count_photons(light, 20.0 if dark else 2000.0, seed=1 if dark else 2)
@@ -151,7 +149,7 @@ def test_another_scene(kind, method) -> None:
 @pytest.mark.parametrize(
     ("brightness", "corner"), [(20.0, (10, -30)), (100.0, (-20, -20)), (300.0, (5, 0))]
 )
-def test_glints_of_any_brightness_elsewhere(method, brightness, corner) -> None:
+def test_glints_of_any_brightness_elsewhere(method, brightness, corner):
     plain = oracle.compute_light(oracle.make_steps())
     scene = oracle.add_retroreflector(oracle.make_steps(RETRO_WALL), brightness, corner)
     bright = oracle.compute_light(scene)
@@ -159,7 +157,7 @@ def test_glints_of_any_brightness_elsewhere(method, brightness, corner) -> None:
     check_returns("retroreflector", method, scene, counts)
 
 
-def test_a_bright_shot_is_iterated_until_the_rim_of_thin_bars_is_gone() -> None:
+def test_a_bright_shot_is_iterated_until_the_rim_of_thin_bars_is_gone():
     """Its false returns lie above and below the bars, which the views see nearly along the columns.
 
     Over four seeds 2.0 to 2.1 % of all are false after 40 iterations, and 1.4 to 1.6 % when bright
@@ -176,7 +174,7 @@ def test_a_bright_shot_is_iterated_until_the_rim_of_thin_bars_is_gone() -> None:
     assert missed <= 0.02
 
 
-def test_the_probability_of_a_false_alarm_is_kept(room, light) -> None:
+def test_the_probability_of_a_false_alarm_is_kept(room, light):
     """In the dark, with 20 photons at the brightest, up to three times as many are false as are said to be."""
     frames = recover_frames(oracle.count_photons(light, 20.0), "l1")
     strict, lenient = depth(frames, false_alarm=0.05), depth(frames, false_alarm=0.5)
@@ -194,7 +192,7 @@ PULSE_ROWS = 3.0
 
 
 @pytest.fixture(scope="module")
-def clean() -> Streak:
+def clean():
     plates = (
         make_plate((-0.15, 0.0, 0.8), (0.2, 0.2), make_plain_pattern(0.8)),
         make_plate((0.15, 0.0, 1.1), (0.25, 0.25), make_plain_pattern(0.5)),
@@ -203,16 +201,16 @@ def clean() -> Streak:
     return simulate_shot(Scene(plates), Instrument(near, StreakDetector(300, 20e-12)), 0).streak
 
 
-def locate(streak: Streak) -> np.ndarray:
+def locate(streak):
     return depth(recover(streak, streak.camera, method="linear")).image("range")
 
 
 @pytest.fixture(scope="module")
-def ranges(clean) -> np.ndarray:
+def ranges(clean):
     return locate(clean)
 
 
-def check_ranges(spoilt: Streak, expected: np.ndarray, missed: float, false: float) -> None:
+def check_ranges(spoilt, expected, missed, false):
     """Fractions of returns that may be missed and false."""
     found = locate(spoilt)
     known, seen = np.isfinite(expected), np.isfinite(found)
@@ -221,13 +219,13 @@ def check_ranges(spoilt: Streak, expected: np.ndarray, missed: float, false: flo
     assert 1 - right / max(seen.sum(), 1) <= false
 
 
-def change(streak: Streak, places: tuple[object, object], value: float) -> Streak:
+def change(streak, places, value):
     counts = streak.counts.astype(np.float32).copy()
     counts[places] = value
     return replace(streak, counts=counts)
 
 
-def test_the_noise_of_the_dark_and_of_light_is_estimated() -> None:
+def test_the_noise_of_the_dark_and_of_light_is_estimated():
     """Of so many measurements the deviation is known to less than a percent; a gain of 3 counts for
     each photon to a few, and never to less than it is: the careful side.
     """
@@ -242,13 +240,13 @@ def test_the_noise_of_the_dark_and_of_light_is_estimated() -> None:
     assert estimate_noise(lit.astype(np.float32))[2] == pytest.approx(3, rel=0.15)
 
 
-def test_a_clean_shot_stays_as_it_is(clean, ranges) -> None:
+def test_a_clean_shot_stays_as_it_is(clean, ranges):
     assert np.isfinite(ranges).sum() > 1000
     assert open_shot(clean).streak is clean
 
 
 @pytest.mark.parametrize("number", [1, 60])
-def test_hot_pixels_have_no_effect(clean, ranges, number) -> None:
+def test_hot_pixels_have_no_effect(clean, ranges, number):
     noise = np.random.default_rng(number)
     rows, columns = clean.counts.shape
     places = noise.integers(2, rows - 2, number), noise.integers(0, columns, number)
@@ -259,7 +257,7 @@ def test_hot_pixels_have_no_effect(clean, ranges, number) -> None:
     check_ranges(hot, ranges, 0.02, 0.02)
 
 
-def test_traces_of_particles_and_a_dead_stripe_have_little_effect(clean, ranges) -> None:
+def test_traces_of_particles_and_a_dead_stripe_have_little_effect(clean, ranges):
     struck = oracle.add_tracks(clean.counts.astype(np.float32), 40)
     check_ranges(replace(clean, counts=struck), ranges, 0.12, 0.03)
     dead = change(clean, (slice(None), slice(200, 212)), 0.0)
@@ -267,7 +265,7 @@ def test_traces_of_particles_and_a_dead_stripe_have_little_effect(clean, ranges)
     check_ranges(dead, ranges, 0.08, 0.03)
 
 
-def test_light_is_no_defect(clean) -> None:
+def test_light_is_no_defect(clean):
     """A point that lasts as long as the pulse, and single photons."""
     pulse = np.exp2(-((2 * (np.arange(clean.counts.shape[0]) - 150.3) / PULSE_ROWS) ** 2))
     point = change(
@@ -286,7 +284,7 @@ def test_light_is_no_defect(clean) -> None:
     assert np.argwhere(found.pixels).tolist() == [[100, 150]]
 
 
-def test_a_plateau_is_the_sensors_limit_and_a_dim_shot_has_none(clean) -> None:
+def test_a_plateau_is_the_sensors_limit_and_a_dim_shot_has_none(clean):
     counts = clean.counts.astype(np.float32)
     level = np.float32(0.3) * counts.max()
     assert find_clipping_level(np.minimum(counts, level)) == level
@@ -295,7 +293,7 @@ def test_a_plateau_is_the_sensors_limit_and_a_dim_shot_has_none(clean) -> None:
         assert find_clipping_level(whole) == np.inf
 
 
-def test_what_strikes_the_sensor_is_not_taken_for_the_lights_own_noise() -> None:
+def test_what_strikes_the_sensor_is_not_taken_for_the_lights_own_noise():
     rows, columns = np.mgrid[:240, :300]
     light = 900 * np.exp(-0.5 * ((rows - 60 - columns / 3) / 1.5) ** 2) * (columns / 300)
     noise = np.random.default_rng(4)
@@ -316,7 +314,7 @@ def test_what_strikes_the_sensor_is_not_taken_for_the_lights_own_noise() -> None
     ],
     ids=lambda method: method.name,
 )
-def test_light_that_is_cut_off_is_recovered_whatever_the_dark_level_is(method) -> None:
+def test_light_that_is_cut_off_is_recovered_whatever_the_dark_level_is(method):
     """Where the sensor ends there is as much light or more: a picture is not flattened to it."""
     picture = np.zeros((16, 16), np.float32)
     picture[3:13, 6:10] = 1

@@ -1,7 +1,5 @@
 """A camera of three views, and a shot of it with one lit row."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from tofclip.camera import Camera, SkewSweep
@@ -19,7 +17,7 @@ CAMERA = Camera(
 COUNTS = np.random.default_rng(0).poisson(40.0, (12, 90)).astype(np.float32)
 
 
-def make_streak() -> Streak:
+def make_streak():
     counts = COUNTS.copy()
     counts[5] += 100
     return Streak(counts, camera=CAMERA).with_bin_width(20e-12)

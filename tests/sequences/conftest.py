@@ -1,20 +1,14 @@
 """Two workers behind a scheduler, as on a cluster, and a small sequence of shots."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tofclip import Streak
 from tofclip.camera import Camera, SkewSweep
 from tofclip.io.streaks import save_stack
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
-from tofclip.simulate.bodies import Body
 from tofclip.simulate.patterns import make_checkerboard, make_plain_pattern
 
 CENTRES = 40.0 + 60 * np.arange(5)
@@ -22,7 +16,7 @@ SHOTS = 6
 
 
 @pytest.fixture(scope="package")
-def scheduler() -> Iterator[str]:
+def scheduler():
     """Address of a scheduler with two workers; a job may outlive one of them and no more."""
     dask = pytest.importorskip("dask", reason="dask.distributed is an extra")
     distributed = pytest.importorskip("distributed", reason="dask.distributed is an extra")
@@ -40,7 +34,7 @@ def scheduler() -> Iterator[str]:
 
 
 @pytest.fixture(scope="package")
-def camera() -> Camera:
+def camera():
     """Five views of 32 x 32 pixels, with its sweep."""
     sweep = SkewSweep(CENTRES, np.array([-2.0, 1.0, 0.0, 0.5, 3.0]), np.zeros(5))
     angles = np.arctan([0.5, -0.8, 0.9, -0.4, 0.1])
@@ -49,7 +43,7 @@ def camera() -> Camera:
     return Camera(CENTRES, angles, (32, 32), 320, sweep=sweep, **times, **optics)
 
 
-def make_body(distance: float, place_px: float, side_px: float = 9, pattern=None) -> Body:
+def make_body(distance, place_px, side_px=9, pattern=None):
     """A plate across the axis, so many pixels wide and aside."""
     at, side = place_px * distance / 100, side_px * distance / 100
     pattern = make_checkerboard(3, 0.3, 0.9) if pattern is None else pattern
@@ -57,10 +51,10 @@ def make_body(distance: float, place_px: float, side_px: float = 9, pattern=None
 
 
 @pytest.fixture(scope="package")
-def see() -> Callable[..., Streak]:
+def see():
     """Simulate a shot of a camera: of two plates, or of one plain one."""
 
-    def simulate(camera: Camera, seed: int = 0, peak: float = 5e4, side_px: float = 0) -> Streak:
+    def simulate(camera, seed=0, peak=5e4, side_px=0):
         plates = make_body(1.1, -8), make_body(1.5, 8)
         if side_px:
             plates = (make_body(1.3, 0, side_px, make_plain_pattern(0.8)),)
@@ -71,15 +65,13 @@ def see() -> Callable[..., Streak]:
 
 
 @pytest.fixture(scope="package")
-def streaks(camera: Camera, see: Callable[..., Streak]) -> list[Streak]:
+def streaks(camera, see):
     """Shots of two plates that differ in their noise."""
     return [see(camera, seed) for seed in range(SHOTS)]
 
 
 @pytest.fixture(scope="package")
-def recorded(
-    tmp_path_factory: pytest.TempPathFactory, camera: Camera, streaks: list[Streak]
-) -> Path:
+def recorded(tmp_path_factory, camera, streaks):
     """A folder with ``camera.h5``, ``shots.h5`` (a stack) and ``shots`` (a folder with a file for
     each).
     """

@@ -2,30 +2,25 @@
 name.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import signal
 import time
-from collections.abc import Callable
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 from tofclip.errors import InputError
 from tofclip.files import atomic_path
 from tofclip.sequences.jobs import Job
 
 
-def square(number: int, result: Path) -> int:
+def square(number, result):
     """Write a square."""
     with atomic_path(result) as temporary:
         temporary.write_text(str(number**2))
     return number**2
 
 
-def meet(own: Path, other: Path) -> None:
+def meet(own, other):
     """Write a result and wait for another job's: both can end only at work at the same time."""
     square(0, own)
     deadline = time.monotonic() + 60
@@ -35,15 +30,15 @@ def meet(own: Path, other: Path) -> None:
         time.sleep(0.01)
 
 
-def refuse(result: Path) -> None:
+def refuse(result):
     raise InputError(f"{result.name}: is not to be had\nat any price")
 
 
-def stumble() -> None:
+def stumble():
     raise ZeroDivisionError("a defect")
 
 
-def die(result: Path, *, every_time: bool) -> None:
+def die(result, *, every_time):
     """Kill the worker in the middle of writing; with `every_time` also the next one."""
     once = result.with_suffix(".died")
     if every_time or not once.exists():
@@ -54,7 +49,7 @@ def die(result: Path, *, every_time: bool) -> None:
     square(7, result)
 
 
-def on_a_full_disk(work: Callable[[], Any]) -> Any:
+def on_a_full_disk(work):
     """Do a job while no file may grow beyond a kilobyte: the system refuses to write on, as a full
     disk does.
     """
@@ -66,7 +61,7 @@ def on_a_full_disk(work: Callable[[], Any]) -> Any:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def squares(folder: Path, count: int) -> list[Job]:
+def squares(folder, count):
     paths = [folder / f"{number:03d}.txt" for number in range(count)]
     return [
         Job(path.stem, path, partial(square, number, path)) for number, path in enumerate(paths)

@@ -15,7 +15,6 @@ from tofclip.sequences import jobs as jobs_module
 from tofclip.sequences.jobs import (
     Failure,
     Job,
-    Report,
     connect_workers,
     count_local_workers,
     lock_output_folder,
@@ -28,7 +27,7 @@ pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them
 MANY = 60  # many times what two workers are given at once
 
 
-def contents(folder: Path) -> dict[str, str]:
+def contents(folder):
     return {path.name: path.read_text() for path in folder.iterdir()}
 
 
@@ -36,7 +35,7 @@ def test_a_failure_is_told_and_stops_nothing(tmp_path):
     jobs = squares(tmp_path, 3)
     refused = Job("refused", tmp_path / "refused.txt", partial(refuse, tmp_path / "refused.txt"))
     stumbling = Job("broken", tmp_path / "broken.txt", stumble)
-    seen: list[Report] = []
+    seen = []
     summary = run_jobs([refused, *jobs, stumbling], on_report=seen.append)
     assert summary.done == 3
     assert summary.failures == (
@@ -110,13 +109,13 @@ def test_without_the_library_it_says_what_to_install(monkeypatch, tmp_path):
         run_jobs(squares(tmp_path, 1), "local:1")
 
 
-def refuse_to_connect(where: str, problem: str) -> None:
+def refuse_to_connect(where, problem):
     with pytest.raises(InputError, match=problem), connect_workers(where):
         pass
 
 
 def test_workers_without_this_program_or_of_another_version_are_refused(scheduler, monkeypatch):
-    def missing() -> str:
+    def missing():
         raise ModuleNotFoundError("No module named 'tofclip'")
 
     with monkeypatch.context() as patch:

@@ -1,7 +1,5 @@
 """Histograms that come live: sums of what drifts are true, and so are gates in coarse steps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -11,15 +9,13 @@ from devices.transients import _make_gate_response
 from tofclip.lidar import Pulse
 from tofclip.lidar.photons import PhotonCube
 from tofclip.sequences import make_pipeline
-from tofclip.sequences.streaming import CloudPipeline
-from tofclip.shots import Returns
 from tofclip.units import SPEED_OF_LIGHT
 
 ROWS, COLUMNS = np.indices((32, 32))
 BIN, SIGMA = 250e-12, 300e-12  # s
 
 
-def take_shot(ranges: np.ndarray, signal: float, seed: list[int]) -> PhotonCube:
+def take_shot(ranges, signal, seed):
     edges = BIN * np.arange(129)[:, np.newaxis, np.newaxis]
     light = signal * np.diff(ndtr((edges - 2 * ranges / SPEED_OF_LIGHT) / SIGMA), axis=0) + 0.02
     times = BIN * (np.arange(128) + 0.5)
@@ -27,11 +23,11 @@ def take_shot(ranges: np.ndarray, signal: float, seed: list[int]) -> PhotonCube:
     return PhotonCube(counts, times, pulse=Pulse.gaussian(SIGMA * np.sqrt(8 * np.log(2))))
 
 
-def find_returns(pipeline: CloudPipeline, shot: PhotonCube) -> Returns:
+def find_returns(pipeline, shot):
     return pipeline.search(pipeline.recover_shot(shot, pipeline.rectify(shot)))
 
 
-def compute_z(found: Returns, truth: np.ndarray) -> float:
+def compute_z(found, truth):
     ratio = (found.range - truth[found.y, found.x]) / found.confidence
     return float(np.sqrt(np.mean(np.clip(ratio, -6, 6) ** 2)))
 
@@ -39,7 +35,7 @@ def compute_z(found: Returns, truth: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("signal", "speed_mm"), [(200.0, 0.0), (20.0, 1.0), (200.0, 1.0), (20.0, 10.0), (200.0, 10.0)]
 )
-def test_what_drifts_is_where_it_is_now(signal: float, speed_mm: float) -> None:
+def test_what_drifts_is_where_it_is_now(signal, speed_mm):
     """Sums of 16 shots were late by 2 to 17 deviations. 16 clouds of 1000 pixels, which share what
     they say of the speed: z scatters by 0.05.
     """
@@ -58,7 +54,7 @@ def test_what_drifts_is_where_it_is_now(signal: float, speed_mm: float) -> None:
 
 @pytest.mark.parametrize(("step_ps", "width_ns"), [(100, 3), (640, 3), (1500, 5)])
 @pytest.mark.parametrize("photons", [20.0, 2000.0])
-def test_gates_in_coarse_steps_say_what_they_do_not_see(step_ps, width_ns, photons) -> None:
+def test_gates_in_coarse_steps_say_what_they_do_not_see(step_ps, width_ns, photons):
     """At steps of 96 mm a millimetre was said of errors of 14; and light that every pixel sees long
     was taken for background.
     """

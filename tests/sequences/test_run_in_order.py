@@ -3,7 +3,6 @@
 import gc
 import threading
 import weakref
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from time import sleep
 
@@ -16,21 +15,21 @@ STEP = 0.05
 
 
 @pytest.fixture
-def worker() -> Iterator[ThreadPoolExecutor]:
+def worker():
     with ThreadPoolExecutor(1) as pool:
         yield pool
 
 
-def slow(value: int) -> int:
+def slow(value):
     sleep(STEP)
     return value
 
 
-def keep(value: int) -> int:
+def keep(value):
     return value
 
 
-def count(number: int, seconds: float = 0.0, begun: Callable[[int], object] = keep):
+def count(number, seconds=0.0, begun=keep):
     for value in range(number):
         sleep(seconds)
         begun(value)
@@ -50,7 +49,7 @@ def test_values_are_worked_on_in_order(worker):
 def test_work_overlaps_and_its_latency_is_measured():
     both = threading.Barrier(2)
 
-    def meet(_: int) -> None:
+    def meet(_):
         both.wait(30)  # passes only while the other worker is at work as well
         slow(0)
 
@@ -60,7 +59,7 @@ def test_work_overlaps_and_its_latency_is_measured():
 
 
 def test_a_slow_consumer_holds_the_source_back(worker):
-    brought: list[int] = []
+    brought = []
     stream = run_in_order(count(50, begun=brought.append), keep, worker, at_once=2, queue_size=2)
     next(stream)
     sleep(4 * STEP)
@@ -76,7 +75,7 @@ def test_the_oldest_of_those_that_wait_are_dropped(worker):
         yield from range(6)
         brought.set()
 
-    def work(value: int) -> int:
+    def work(value):
         brought.wait(30)
         return slow(value)
 
@@ -99,14 +98,14 @@ def test_a_slow_consumer_gets_the_newest_where_that_is_wanted():
 def test_results_that_nobody_took_make_room_for_others():
     """After a consumer was slow, as many things as before are worked on at once."""
     together, waited = threading.Barrier(3), threading.Event()
-    done: list[int] = []
+    done = []
 
     def source():
         yield from range(6)
         waited.wait(30)
         yield from (100, 101, 102)
 
-    def work(value: int) -> int:
+    def work(value):
         if value >= 100:
             together.wait(10)  # passes only where all three are at work
         done.append(value)
@@ -126,7 +125,7 @@ def test_few_things_are_alive(worker):
     class Thing:
         pass
 
-    alive: weakref.WeakSet[Thing] = weakref.WeakSet()
+    alive = weakref.WeakSet()
     highest = 0
 
     def source():
@@ -139,7 +138,7 @@ def test_few_things_are_alive(worker):
             highest = max(highest, len(alive))
             yield thing
 
-    def work(_: Thing) -> int:
+    def work(_):
         sleep(STEP / 10)  # slower than the source, so that things pile up if they can
         return 1
 
@@ -156,7 +155,7 @@ def test_a_fault_is_raised_behind_what_was_done(place, worker):
             raise OSError("unplugged")
         yield from range(3, 99)
 
-    def work(value: int) -> int:
+    def work(value):
         if place == "work" and value == 3:
             raise OSError("unplugged")
         return value
@@ -187,15 +186,15 @@ def test_leaving_early_ends_the_threads_and_closes_the_source(worker):
 
 
 def test_what_fails_is_told_and_the_stream_goes_on(worker):
-    def work(value: int) -> int:
+    def work(value):
         if value == 2:
             raise InputError("dark")
         return value
 
-    failed: list[tuple[int, str]] = []
+    failed = []
     source = [0, InputError("half written"), 2, 3]
 
-    def note(number: int, fault: Exception) -> None:
+    def note(number, fault):
         failed.append((number, str(fault)))
 
     items = run_in_order(source, work, worker, 1, on_failure=note)

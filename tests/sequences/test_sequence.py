@@ -50,7 +50,7 @@ def make_clouds(shots, pipeline, average=1, steady=True, first=0):
     )
 
 
-def nearest(cloud) -> np.ndarray:
+def nearest(cloud):
     return cloud.range[cloud.range < 1.3]
 
 
@@ -70,7 +70,7 @@ def test_jitter_is_found_and_taken_off(shot, pipeline):
 def test_averaging_lowers_the_noise_and_a_sequence_goes_on_where_it_stopped(shot, pipeline):
     shots = [partial(shot, 0.0, seed, 60.0) for seed in range(10)]
 
-    def change(*clouds) -> float:
+    def change(*clouds):
         """Median over the pixels that see something near in both."""
         ranges = []
         for cloud in clouds:

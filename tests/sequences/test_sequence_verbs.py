@@ -27,10 +27,10 @@ ROOT = Path(tofclip.__file__).parents[1]
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]):
+def run(capsys):
     """Run the program with the words of a line."""
 
-    def call(line: str) -> tuple[int, str, str]:
+    def call(line):
         capsys.readouterr()
         return main(line.split()), *capsys.readouterr()
 
@@ -38,7 +38,7 @@ def run(capsys: pytest.CaptureFixture[str]):
 
 
 @pytest.fixture
-def few(recorded: Path, tmp_path: Path) -> Path:
+def few(recorded, tmp_path):
     """Two good shots, and one between them that carries no camera."""
     folder = tmp_path / "shots"
     folder.mkdir()

@@ -5,7 +5,6 @@ import shutil
 import weakref
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ SHOTS = 6
 
 
 @pytest.fixture
-def linear(recorded: Path) -> RecoverySettings:
+def linear(recorded):
     return RecoverySettings("linear", camera=recorded / "camera.h5")
 
 

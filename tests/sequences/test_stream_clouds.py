@@ -1,6 +1,5 @@
 """Shots to clouds while they come, against the same shots one by one; and each shot begun at the last."""
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Event
@@ -25,14 +24,14 @@ from tofclip.solvers import Sparse
 CENTRES = 30.0 + 45 * np.arange(4)
 
 
-def shots(number: int) -> list[Streak]:
+def shots(number):
     """Plates that come nearer from shot to shot."""
     angles, still = np.arctan([0.6, -0.7, 0.3, -0.1]), SkewSweep(CENTRES, np.zeros(4), np.zeros(4))
     times = {"time_zero": -6e-9, "pulse_fwhm": 150e-12}
     camera = Camera(CENTRES, angles, (24, 24), 200, sweep=still, **times)
     made = Instrument(camera, StreakDetector(96, 50e-12, peak_photons=5e4))
 
-    def see(shot: int) -> Streak:
+    def see(shot):
         at, plain = (0.0, 0.0, 1.4 - 0.05 * shot), make_plain_pattern(0.8)
         return simulate_shot(Scene((make_plate(at, (0.05, 0.05), plain),)), made, shot).streak
 
@@ -128,7 +127,7 @@ def test_surfaces_follow_those_of_the_last_shot_until_the_scene_changes(streaks,
 def test_leaving_clouds_early_closes_their_source(prepared):
     made, closed = shots(1), Event()
 
-    def source() -> Iterator[Streak]:
+    def source():
         try:
             while True:
                 yield made[0]
@@ -145,7 +144,7 @@ def test_leaving_clouds_early_closes_their_source(prepared):
 class CountingExecutor(ThreadPoolExecutor):
     """One worker, which begins when it is told to; counts what it holds at most."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(1)
         self.held = self.most = 0
         self.begin = Event()
@@ -158,13 +157,13 @@ class CountingExecutor(ThreadPoolExecutor):
         future.add_done_callback(self.count_down)
         return future
 
-    def await_most(self, number: int) -> None:
+    def await_most(self, number):
         """Wait until so many were held, five seconds at most."""
         deadline = monotonic() + 5
         while self.most < number and monotonic() < deadline:
             sleep(0.01)
 
-    def count_down(self, _: object) -> None:
+    def count_down(self, _):
         self.held -= 1
 
 
@@ -174,7 +173,7 @@ def test_no_shot_grows_old_behind_others_where_the_newest_is_wanted(policy, most
     made = shots(1)
     with CountingExecutor() as executor:
 
-        def source() -> Iterator[Streak]:
+        def source():
             for number in range(6):
                 yield made[0]
                 if number + 1 == most:
@@ -252,7 +251,7 @@ def test_a_row_begins_at_its_own_picture_whatever_rows_were_lit_before():
     method = Sparse(iterations=600, gap=0.0)
     recovery = WarmStartedRecovery(method, [(slice(0, 999), operator)], ~camera.dead_columns)
 
-    def recover(*rows: int) -> dict[int, np.ndarray]:
+    def recover(*rows):
         bins = TraceBins(np.array(rows), np.ones(len(rows), bool), np.ones(len(rows), np.float32))
         traces = recovery.recover(seen[:, rows], bins)
         pictures = np.empty((traces.pixels.size, len(rows)), np.float32)

@@ -1,7 +1,5 @@
 """Frames keep their axes, camera and attachments; a streak image is checked once, at construction."""
 
-from __future__ import annotations
-
 import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
@@ -83,7 +81,7 @@ def test_frames_take_their_returns_along():
     )
     frames = Frames(VALUES, TIMES, CAMERA, returns=returns)
 
-    def left(part: Frames) -> list[float]:
+    def left(part):
         assert part.returns is not None
         return list(np.round(part.returns.time * 1e12, 3))
 

@@ -1,7 +1,5 @@
 """Instruments on paper: known truths of small cameras, predictions beside simulated shots, and files."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 hand.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +19,7 @@ from tofclip.simulate import (
     render_true_frames,
     simulate_shot,
 )
-from tofclip.simulate.bodies import NO_BODY, Body, cast_rays, look_up_reflectance
+from tofclip.simulate.bodies import NO_BODY, cast_rays, look_up_reflectance
 from tofclip.simulate.patterns import (
     cut_pattern,
     make_letter,
@@ -36,7 +34,7 @@ ORIGIN = np.zeros(3)
 AHEAD = np.array([[0.0, 0.0, 1.0]])
 
 
-def wall(depth: float, side: float = 10.0, **turned: float) -> Body:
+def wall(depth, side=10.0, **turned):
     return make_plate((0.0, 0.0, depth), (side, side), np.full((4, 4), 0.5), **turned)
 
 
@@ -131,7 +129,7 @@ WIDE_PITCH = 20e-3  # metres; makes the parallax several pixels
 FOCUS = 2.0
 
 
-def instrument(rows: int = 200, around: float = 2.0, **camera: object) -> Instrument:
+def instrument(rows=200, around=2.0, **camera):
     """Three views of 48 x 64 pixels; light from range `around` arrives in row 60."""
     time_zero = 60 * BIN - 2 * around / SPEED_OF_LIGHT
     optics = {"focal_length_px": FOCAL, "lenslet_pitch": WIDE_PITCH, "focus_distance": FOCUS}
@@ -140,22 +138,22 @@ def instrument(rows: int = 200, around: float = 2.0, **camera: object) -> Instru
     return Instrument(made, StreakDetector(rows=rows), rays_per_pixel_side=6)
 
 
-def spot(x_px: float = 0.0, y_px: float = 0.0, depth: float = 2.0) -> Scene:
+def spot(x_px=0.0, y_px=0.0, depth=2.0):
     """A square as large as a pixel, seen from the reference view at (x, y) from the optical axis."""
     pixel = depth / FOCAL
     place = (x_px * pixel, y_px * pixel, depth)
     return Scene((make_plate(place, (pixel, pixel), np.ones((1, 1))),))
 
 
-def centroid(amounts: np.ndarray) -> float:
+def centroid(amounts):
     return float(np.sum(amounts * np.arange(amounts.size)) / np.sum(amounts))
 
 
-def width(amounts: np.ndarray, middle: float) -> float:
+def width(amounts, middle):
     return np.sum(amounts * (np.arange(amounts.size) - middle) ** 2) / amounts.sum()
 
 
-def plate(pattern: np.ndarray, size: tuple[float, float], depth: float = 2.0) -> Scene:
+def plate(pattern, size, depth=2.0):
     return Scene((make_plate((0, 0, depth), size, pattern),))
 
 
@@ -238,7 +236,7 @@ def test_recovery_s_operator_agrees_with_the_ray_caster(depth):
     shot = simulate_shot(scene, made, 0)
     frames = np.moveaxis(render_true_frames(scene, made, shot.exposure).values, 0, -1)
 
-    def mismatch(shear: float) -> float:
+    def mismatch(shear):
         predicted = made.camera.operator(shear)(np.ascontiguousarray(frames)).T
         return float(np.linalg.norm(predicted - shot.signal) / np.linalg.norm(shot.signal))
 

@@ -2,8 +2,6 @@
 solve, its fixed points, its gain over the start.
 """
 
-from __future__ import annotations
-
 import sys
 from functools import partial
 
@@ -32,7 +30,7 @@ DEVIATION = 0.1
 
 
 @pytest.fixture(scope="module")
-def clean() -> np.ndarray:
+def clean():
     """Two bars, a ramp and a disc: edges, a slope and a curve."""
     y, x = np.mgrid[:72, :65].astype(np.float32)
     picture = 0.3 * x / 65
@@ -43,11 +41,11 @@ def clean() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def noisy(clean) -> np.ndarray:
+def noisy(clean):
     return clean + np.random.default_rng(0).normal(0, DEVIATION, clean.shape).astype(np.float32)
 
 
-def left_over(found: np.ndarray, clean: np.ndarray) -> float:
+def left_over(found, clean):
     """Share of the noise's energy."""
     assert found.dtype == clean.dtype
     return float(np.mean((found - clean) ** 2)) / DEVIATION**2
@@ -104,18 +102,18 @@ SMALL = RadonProjection((7, 6), 7, np.arange(5) * np.pi / 5, np.zeros(5), dtype=
 
 
 @pytest.fixture(scope="module")
-def truth() -> np.ndarray:
+def truth():
     picture = np.zeros(SHAPE)
     picture[8:40, 8:13] = picture[8:40, 24:29] = 1
     picture[8:13, 8:40] = 0.6
     return picture
 
 
-def measure(*pictures: np.ndarray) -> np.ndarray:
+def measure(*pictures):
     return np.stack([OPERATOR(picture) for picture in pictures], axis=1)
 
 
-def recover(method: object, measurements: np.ndarray) -> np.ndarray:
+def recover(method, measurements):
     return method.recover(OPERATOR, measurements).frames
 
 
@@ -168,7 +166,7 @@ def test_it_improves_on_its_start(truth):
     assert result.stop_reason == "8 calls of the denoiser done"
 
 
-def blur(noisy: np.ndarray, pilot: np.ndarray, deviation: float) -> np.ndarray:
+def blur(noisy, pilot, deviation):
     return gaussian_filter(noisy, 1.0)
 
 

@@ -1,7 +1,5 @@
 """The iterative solver and its priors against problems whose answers are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 
@@ -13,14 +11,11 @@ import scipy.sparse
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LineProjection, RadonProjection, SparseMatrix, estimate_squared_norm
 from tofclip.solvers import (
-    DataTerm,
     Fista,
     Huber,
     LeastSquares,
     NonnegativeSparsity,
     NonnegativeTotalVariation,
-    ProximalStep,
-    Regulariser,
     Sparse,
     StoppingRule,
     TotalVariation,
@@ -41,28 +36,28 @@ PICTURE = np.zeros((12, 11))
 PICTURE[3:5, 4:8] = [[1, 2, 1, 3], [2, 2, 1, 1]]
 
 
-def l1_and_tv(*settings: float):
+def l1_and_tv(*settings):
     methods = Sparse(*settings), TotalVariation(*settings)
     return pytest.mark.parametrize("method", methods, ids=["l1", "tv"])
 
 
-def identity(shape: tuple[int, int]) -> SparseMatrix:
+def identity(shape):
     size = shape[0] * shape[1]
     return SparseMatrix(scipy.sparse.eye_array(size, format="csr"), shape, (size,))
 
 
-def projection(dtype: type = np.float64) -> LineProjection:
+def projection(dtype=np.float64):
     centres, angles, gains = [8.2, 20.0, 31.5], [-0.7, 0.05, 0.6], [1.0, 0.8, 1.1]
     return LineProjection((12, 11), 40, centres, angles, gains, dtype)
 
 
-def begin(data_term: DataTerm, prior: Regulariser) -> Fista:
+def begin(data_term, prior):
     """A block of `LANES` frames of `projection`, at darkness."""
     operator = projection()
     return Fista(operator, data_term, prior, 1 / estimate_squared_norm(operator, 99), LANES)
 
 
-def solve(measurements: np.ndarray, prior: Regulariser, iterations: int) -> Fista:
+def solve(measurements, prior, iterations):
     """The same frame in every lane."""
     term = LeastSquares(np.tile(measurements[:, np.newaxis], (1, LANES)))
     solver = begin(term, prior)
@@ -70,7 +65,7 @@ def solve(measurements: np.ndarray, prior: Regulariser, iterations: int) -> Fist
     return solver
 
 
-def noise(seed: int, frames: int = 5) -> np.ndarray:
+def noise(seed, frames=5):
     return np.abs(np.random.default_rng(seed).standard_normal((40, frames)))
 
 
@@ -185,14 +180,14 @@ def test_tolerance_stops_and_says_so():
 class _Scripted:
     """A solver whose objectives, and whether a step was refused, are given beforehand."""
 
-    def __init__(self, *steps: tuple[float, bool]) -> None:
+    def __init__(self, *steps):
         self._steps = list(steps)
         self.objective, self.rejected = np.array([10.0]), np.array([False])
 
-    def duality_gap(self) -> None:
+    def duality_gap(self):
         raise AssertionError("nobody asked for the gap")
 
-    def step(self) -> None:
+    def step(self):
         value, refused = self._steps.pop(0)
         self.objective, self.rejected = np.array([value]), np.array([refused])
 
@@ -247,7 +242,7 @@ def test_steps_grow_as_far_as_they_are_safe_and_save_iterations():
 class _WithoutDistance(NonnegativeSparsity):
     """Keeps all steps at one size."""
 
-    def proximal_step(self, *given: np.ndarray) -> ProximalStep:
+    def proximal_step(self, *given):
         return super().proximal_step(*given)._replace(distance=None)
 
 
@@ -295,7 +290,7 @@ def test_further_iterations_follow_only_while_the_objective_falls():
     assert settled.recover(operator, measurements).iterations == done.iterations
 
 
-def test_noise_is_not_followed_and_light_is() -> None:
+def test_noise_is_not_followed_and_light_is():
     operator, random = projection(), np.random.default_rng(7)
     method = Sparse(1e-3, 200, gap=0.0, noise_fall=2e-3)
     dark = method.recover(operator, random.standard_normal((40, 5)))
@@ -363,7 +358,7 @@ def test_the_objective_at_the_beginning_is_that_of_the_pictures_given(method):
         method.recover(operator, measurements, start=before.frames[:1])
 
 
-def denoise(prior: Regulariser, noisy: np.ndarray, calls: int) -> tuple[np.ndarray, np.ndarray]:
+def denoise(prior, noisy, calls):
     """Run the warm-started proximal step on the same point until it has converged."""
     still = np.zeros(noisy.shape[-1], noisy.dtype)
     for _ in range(calls):
@@ -373,9 +368,7 @@ def denoise(prior: Regulariser, noisy: np.ndarray, calls: int) -> tuple[np.ndarr
     return result, penalty
 
 
-def smooth(
-    picture: np.ndarray, weight: float, calls: int = 400, dtype: type = np.float64
-) -> tuple[np.ndarray, float]:
+def smooth(picture, weight, calls=400, dtype=np.float64):
     """Total variation of one picture, in a block of many."""
     block = np.tile(picture.astype(dtype)[..., np.newaxis], (1, 1, LANES))
     result, penalty = denoise(NonnegativeTotalVariation(weight), block, calls)
@@ -389,7 +382,7 @@ def test_it_beats_every_nearby_picture():
     picture, weight = rng.random((9, 8)) + 0.5, 0.15
     best, _ = smooth(picture, weight, calls=4000)
 
-    def objective(x: np.ndarray) -> float:
+    def objective(x):
         vertical, horizontal = np.zeros_like(x), np.zeros_like(x)
         vertical[:-1], horizontal[:, :-1] = np.diff(x, axis=0), np.diff(x, axis=1)
         return 0.5 * np.sum((x - picture) ** 2) + weight * np.sum(np.hypot(vertical, horizontal))

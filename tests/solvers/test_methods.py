@@ -2,8 +2,6 @@
 a weight by cross-validation.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 
@@ -166,12 +164,12 @@ def test_what_cannot_be_is_refused(make, message):
 
 
 @pytest.fixture
-def operator() -> LineProjection:
+def operator():
     centres, angles, gains = [8.2, 20.0, 31.5], [-0.7, 0.05, 0.6], [1.0, 0.8, 1.1]
     return LineProjection((12, 11), 40, centres, angles, gains, np.float64)
 
 
-def readings(frames: int, seed: int = 0, pixels: int = 40) -> np.ndarray:
+def readings(frames, seed=0, pixels=40):
     return np.random.default_rng(seed).random((pixels, frames))
 
 
@@ -235,7 +233,7 @@ def test_frames_come_in_the_order_of_the_readings_and_progress_adds_up(operator,
 
 @every_method
 def test_an_interruption_gets_through(operator, method):
-    def interrupt(_: int) -> None:
+    def interrupt(_):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -281,7 +279,7 @@ def test_a_lone_picture_is_recovered_as_in_a_block(method):
 
 
 @pytest.fixture(scope="module")
-def prepared() -> PreparedInverse:
+def prepared():
     camera = Camera([30.0, 85.0, 140.0], np.radians([-40.0, 5.0, 35.0]), (21, 37), 170)
     return LinearInverse().prepare(camera.operator())
 
@@ -335,13 +333,13 @@ def test_the_picture_is_nearly_as_good_as_with_the_best_weight(noise):
     measurements = (clean + error).astype(np.float32)
     method = TotalVariation(1.0, 200, 1e-4)
 
-    def compute_error(weight: float) -> float:
+    def compute_error(weight):
         found = replace(method, weight=weight).recover(operator, measurements[:, np.newaxis])
         return nmse(found.frames[0], truth)
 
     best = min(compute_error(weight) for weight in 10.0 ** np.arange(-3, -0.5, 0.25))
     # 20 % is the project's acceptance for a weight chosen without the truth
-    done: list[int] = []
+    done = []
     found = choose_weight(method, operator, measurements, 40, progress=done.append)
     assert compute_error(found.weight) < 1.2 * best
     assert sum(done) == MAX_WEIGHT_WORK  # a bar ends at its end

@@ -2,8 +2,6 @@
 without waiting.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
@@ -23,7 +21,6 @@ from tofclip.solvers import (
     NonnegativeTotalVariation,
     PlugAndPlay,
     Poisson,
-    Regulariser,
     Sparse,
     StoppingRule,
     TotalVariation,
@@ -48,13 +45,13 @@ def device(request):
     return find_device(request.param)
 
 
-def projection(dtype: type = np.float32) -> LineProjection:
+def projection(dtype=np.float32):
     return LineProjection(
         (24, 23), 90, [14.2, 45.0, 74.5], [-0.7, 0.05, 0.6], [1.0, 0.8, 1.1], dtype
     )
 
 
-def letters(frames: int, dtype: type = np.float32) -> tuple[np.ndarray, np.ndarray]:
+def letters(frames, dtype=np.float32):
     """Measurements of bright rectangles with noise, and a mask with a bad reading here and there."""
     rng = np.random.default_rng(7)
     truth = np.zeros((24, 23, frames))
@@ -66,7 +63,7 @@ def letters(frames: int, dtype: type = np.float32) -> tuple[np.ndarray, np.ndarr
     return measurements.astype(dtype), rng.random(measurements.shape) > 0.03
 
 
-def difference(found: np.ndarray, expected: np.ndarray) -> float:
+def difference(found, expected):
     """Norm of what two recoveries differ by, relative."""
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
@@ -140,7 +137,7 @@ def test_a_tolerance_stops_at_the_same_iteration(device):
     assert found.iterations == expected.iterations < 200
 
 
-def begin(measurements: object, prior: Regulariser) -> Fista:
+def begin(measurements, prior):
     step = 1 / estimate_squared_norm(projection())
     return Fista(projection(), LeastSquares(measurements), prior, step, measurements.shape[1])
 
@@ -153,7 +150,7 @@ def test_no_step_waits_for_the_device(prior, monkeypatch):
     solver = begin(measurements, prior(0.5))
     solver.step()
 
-    def asked(array: object) -> None:
+    def asked(array):
         raise AssertionError("the array was asked for its value")
 
     for question in ("__bool__", "__float__", "__int__", "__index__", "__array__", "__complex__"):
