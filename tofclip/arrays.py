@@ -100,8 +100,7 @@ def to_numpy(array: Array) -> AnyArray:
         array = array.detach().cpu()
     elif hasattr(array, "get") and not is_numpy(array):  # CuPy copies nothing unless asked to
         array = array.get()
-    values: AnyArray = np.asarray(array)
-    return values
+    return np.asarray(array)
 
 
 def is_complex(array: Array) -> bool:

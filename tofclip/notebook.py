@@ -133,8 +133,7 @@ def paint(picture: NDArray[np.floating], name: str = PICTURE_COLOURMAP) -> NDArr
     """Return red, green and blue of brightness 0 to 1, in a further axis; NaN is as dark as 0."""
     from matplotlib import colormaps  # slow to load
 
-    painted: NDArray[np.uint8] = colormaps[name](np.nan_to_num(picture), bytes=True)[..., :3]
-    return painted
+    return colormaps[name](np.nan_to_num(picture), bytes=True)[..., :3]
 
 
 def _encode_picture(picture: NDArray[np.floating]) -> str:

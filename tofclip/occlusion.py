@@ -304,5 +304,4 @@ def _shear_mask(occlusion_mask: Array, shear: float, view: View) -> Array:
     sides = zip(view, occlusion_mask.shape, strict=True)
     if any(abs(shear * step) >= size for step, size in sides):
         return np.zeros_like(occlusion_mask)
-    moved: Array = LinearShear(occlusion_mask.shape, shear, view)(occlusion_mask)
-    return moved
+    return LinearShear(occlusion_mask.shape, shear, view)(occlusion_mask)

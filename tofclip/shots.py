@@ -454,8 +454,7 @@ class Frames(Storable):
         at = self.times if range is None else self.ranges
         first, stop = np.searchsorted(at, limits[0]), np.searchsorted(at, limits[1], side="right")
         require(first < stop, f"no frame lies between {limits[0]:g} and {limits[1]:g}")
-        chosen: Frames = self[int(first) : int(stop)]
-        return chosen
+        return self[int(first) : int(stop)]
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -335,8 +335,7 @@ class Storable:
     @classmethod
     def from_record(cls: type[StorableType], record: Record) -> StorableType:
         """Rebuild an object from what was stored."""
-        rebuilt: StorableType = _read_fields(cls, record)
-        return rebuilt
+        return _read_fields(cls, record)
 
     def save(self, path: str | Path) -> None:
         """Write everything to one HDF5 file, whole or not at all."""

@@ -126,8 +126,7 @@ def _subtract_background(picture: ArrayLike, background: ArrayLike) -> FloatArra
         np.all(np.isfinite(a)) and np.all(np.isfinite(b)),
         "calibration pictures must not hold NaN or infinity",
     )
-    difference: FloatArray = a - b
-    return difference
+    return a - b
 
 
 def _find_dots(dots: FloatArray, views: int) -> tuple[int, IndexArray]:
@@ -180,8 +179,7 @@ def _fit_dot(profile: FloatArray, column: int) -> tuple[float, float]:
     def model(
         x: FloatArray, height: float, centre: float, width: float, floor: float
     ) -> FloatArray:
-        value: FloatArray = height * np.exp(-((x - centre) ** 2) / (2 * width**2)) + floor
-        return value
+        return height * np.exp(-((x - centre) ** 2) / (2 * width**2)) + floor
 
     try:
         # A dot is some 3 px wide where the fit begins; only the core is given to it.

@@ -162,8 +162,7 @@ def _interpolate_linearly(
     # the outer pieces go on beyond the knots, where np.interp would hold the end values
     piece = np.clip(np.searchsorted(knots, position) - 1, 0, knots.size - 2)
     slope = np.diff(values) / np.diff(knots)
-    extended: FloatArray = values[piece] + slope[piece] * (position - knots[piece])
-    return extended
+    return values[piece] + slope[piece] * (position - knots[piece])
 
 
 # Mean over three set-ups of the same family of instruments (244, 271 and 282 px), fitted to the measured
@@ -417,8 +416,7 @@ class Camera(Storable):
         """
         # An infinite focus distance gives 0 here, so that views coincide at infinity.
         nearness = 1 / np.asarray(distance, dtype=np.float64) - 1 / self.focus_distance
-        shear: FloatArray = -self.focal_length_px * self.lenslet_pitch * nearness
-        return shear
+        return -self.focal_length_px * self.lenslet_pitch * nearness
 
     @property
     def displacement_per_shear(self) -> tuple[float, float]:

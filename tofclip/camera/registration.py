@@ -95,8 +95,7 @@ def _extract_structure(energies: FloatArray) -> FloatArray:
     # The root gives bright and dim returns the same noise, so that a single bright one does not
     # decide.
     compressed = np.sqrt(np.maximum(energies, 0))
-    detail: FloatArray = compressed - gaussian_filter1d(compressed, TREND_ROWS, axis=1)
-    return detail
+    return compressed - gaussian_filter1d(compressed, TREND_ROWS, axis=1)
 
 
 def _match_curves(curve: FloatArray, reference: FloatArray) -> tuple[float, float, float]:
@@ -299,8 +298,7 @@ def _remove_picture_shift(camera: Camera, moves: FloatArray) -> FloatArray:
     if camera.views < MIN_VIEWS_TO_SHIFT:
         return moves
     shifts = np.stack([np.ones(camera.views), np.tan(camera.angles)], axis=1)
-    rest: FloatArray = moves - shifts @ np.linalg.lstsq(shifts, moves, rcond=None)[0]
-    return rest
+    return moves - shifts @ np.linalg.lstsq(shifts, moves, rcond=None)[0]
 
 
 @dataclass(frozen=True)
@@ -353,5 +351,4 @@ class _Evidence:
         # A view without any structure leaves a column of zeros: the ridge keeps its numbers as
         # they are.
         ridge = 1e-9 * np.eye(normal.shape[0])
-        solution: FloatArray = np.linalg.solve(normal + ridge, moment) / scale
-        return solution
+        return np.linalg.solve(normal + ridge, moment) / scale

@@ -55,8 +55,7 @@ def find_smooth_labels(
             else:
                 said, heard = said[..., pixels], messages[towards, ..., neighbours]
             heard += (said - heard) / 2  # half of the step: undamped messages may oscillate
-    chosen: IntArray = (own + messages.sum(axis=0)).argmin(axis=0)
-    return chosen
+    return (own + messages.sum(axis=0)).argmin(axis=0)
 
 
 def _pass_message(costs: Array, price: np.float32) -> Array:
@@ -67,8 +66,7 @@ def _pass_message(costs: Array, price: np.float32) -> Array:
     for step in range(1, MAX_LABEL_STEP):
         np.minimum(found[step:], costs[:-step] + step * price, out=found[step:])
         np.minimum(found[:-step], costs[step:] + step * price, out=found[:-step])
-    relative: Array = found - cheapest
-    return relative
+    return found - cheapest
 
 
 TYPICAL_QUANTILE = 0.9  # quantile of the best sharpness: what a textured pixel has
@@ -101,8 +99,7 @@ class FocalStack:
         columns) `depths`.
         """
         require_shape("the map of depths", self.pictures.shape[1:], depths.shape)
-        found: Array = np.take_along_axis(self.pictures, depths[np.newaxis], axis=0)[0]
-        return found
+        return np.take_along_axis(self.pictures, depths[np.newaxis], axis=0)[0]
 
 
 def make_focal_stack(
@@ -132,8 +129,7 @@ def compute_modified_laplacian(pictures: Array) -> Array:
 def compute_image_energy(pictures: Array) -> Array:
     """Squared slopes along rows and columns, added; shapes as in `compute_modified_laplacian`."""
     down, across = np.gradient(pictures, axis=(-2, -1))
-    energy: Array = down**2 + across**2
-    return energy
+    return down**2 + across**2
 
 
 def estimate_depth_from_focus(

@@ -219,8 +219,7 @@ class ClipMeasurement(Storable):
             self.photons_per_unit > 0,
             "these measurements do not say how many photons they stand for; take squares or huber",
         )
-        counted: AnyArray = self.values * np.float32(self.photons_per_unit)
-        return counted
+        return self.values * np.float32(self.photons_per_unit)
 
 
 def measure(light_field: LightField, setup: CameraSetup) -> ClipMeasurement:

@@ -342,8 +342,7 @@ class AshokCamera(ApertureMaskCamera):
         others = 1 + np.random.default_rng(self.seed).permutation(self._order - 1)
         # row 0 of the Hadamard matrix opens all cells; +-1 become open and closed
         rows = np.append(0, others[: self.exposures - 1])
-        open_cells: FloatArray = (1 + hadamard(self._order)[rows, : len(self.views)]) / 2
-        return open_cells
+        return (1 + hadamard(self._order)[rows, : len(self.views)]) / 2
 
 
 class BabacanCamera(ApertureMaskCamera):

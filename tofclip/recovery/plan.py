@@ -110,8 +110,7 @@ def make_method(name: str, **settings: Any) -> AnyMethod:
         given["denoiser"] = DENOISERS.make(denoiser, own)
     if "start" in known and further and further.keys() <= {"iterations", "weight"}:
         given["start"], further = METHODS.make("tv", further), {}
-    made: AnyMethod = METHODS.make(name, given | further, others)
-    return made
+    return METHODS.make(name, given | further, others)
 
 
 @dataclass(frozen=True)

@@ -153,8 +153,7 @@ class Lambertian:
         """Return the pattern's values at (points, 2) places from 0 to 1, right and down."""
         size = np.array(self.pattern.shape[::-1])
         column, row = np.clip((np.nan_to_num(place) * size).astype(np.int64), 0, size - 1).T
-        found: Array = self.pattern[row, column]
-        return found
+        return self.pattern[row, column]
 
     def radiance(self, place: Array, normal: Array, directions: Array, light: Array) -> Array:
         """Return the light that goes back along rays, (points,), from each `place` on the surface.

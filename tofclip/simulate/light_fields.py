@@ -165,8 +165,7 @@ def render_view(scene: Scene, array: CameraArray, view: View) -> Array:
     _, brightness = _shade_rays(scene, origin, directions)
     rows, columns = array.image_shape
     by_pixel = brightness.reshape(rows, array.samples, columns, array.samples)
-    picture: Array = by_pixel.mean(axis=(1, 3)).astype(np.float32)
-    return picture
+    return by_pixel.mean(axis=(1, 3)).astype(np.float32)
 
 
 def render_shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) -> Array:

@@ -144,5 +144,4 @@ def make_mottled_pattern(dark: float, bright: float, grains: int, seed: int) -> 
     frequency = np.hypot(down, across) * TEXT_TEXELS
     field = np.fft.irfft2(spectrum * np.exp(-((frequency / grains) ** 2)), s=shape)
     level = (field - field.min()) / np.ptp(field)
-    pattern: Pattern = (dark + (bright - dark) * level).astype(np.float32)
-    return pattern
+    return (dark + (bright - dark) * level).astype(np.float32)

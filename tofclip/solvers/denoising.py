@@ -67,8 +67,7 @@ class BlockMatching:
             "without it take the denoiser 'collaborative'"
         ):
             from bm3d import bm3d
-        clean: Picture = np.asarray(bm3d(noisy, deviation), noisy.dtype)
-        return clean
+        return np.asarray(bm3d(noisy, deviation), noisy.dtype)
 
 
 @dataclass(frozen=True)

@@ -489,8 +489,7 @@ def assign_folds(count: int, run: int, seed: int) -> BoolArray:
     dealt = np.random.default_rng(seed).permutation(runs) % min(FOLD_COUNT, runs)
     # This many runs in one fold already give the error to a few percent.
     used = 1 if runs >= SINGLE_FOLD_RUNS else min(FOLD_COUNT, runs)
-    out: BoolArray = np.repeat(dealt, run)[:count, np.newaxis] == np.arange(used)
-    return out
+    return np.repeat(dealt, run)[:count, np.newaxis] == np.arange(used)
 
 
 def _search_downhill(
