@@ -187,10 +187,7 @@ class ComputeDevice:
         """Return a context in which what is made is made here: CuPy works on its current device
         only.
         """
-        context: AbstractContextManager[Any] = (
-            self.device if self.library == "cupy" and self.device else nullcontext()
-        )
-        return context
+        return self.device if self.library == "cupy" and self.device else nullcontext()
 
     def __str__(self) -> str:
         if self.library == "numpy":

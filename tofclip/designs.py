@@ -136,7 +136,7 @@ class Design:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value: Any = getattr(self, item.name)
+            value = getattr(self, item.name)
             number = isinstance(value, int | float) and not isinstance(value, bool)
             if item.name == "sensor":
                 good, wanted = value in SENSORS, f"one of {', '.join(SENSORS)}"

@@ -141,7 +141,7 @@ class TimedMeasurements:
     @property
     def history(self) -> Array:
         """All measurements together at each instant, (bins,)."""
-        return np.asarray(self.values.sum(axis=0, dtype=np.float64))
+        return self.values.sum(axis=0, dtype=np.float64)
 
     def find_returns(self) -> tuple[Return, ...]:
         """Find the two strongest returns, the nearer first; a gate ends at the darkest instant
@@ -194,7 +194,7 @@ class TimedMeasurements:
 
     def sum_gate(self, bins: slice) -> Array:
         """Return the measurements summed over some instants, (measurements,) float32."""
-        return np.asarray(self.values[:, bins].sum(axis=1))
+        return self.values[:, bins].sum(axis=1)
 
     def measurement(self, bins: slice) -> ClipMeasurement:
         """Return what an ordinary recovery takes, of some instants."""

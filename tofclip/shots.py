@@ -175,7 +175,7 @@ class Streak(Storable):
             raise MissingTimeAxisError(
                 f"{self.source} has no time axis: give the duration of a row (`bin_width`)"
             )
-        return np.asarray(self.row_times)
+        return self.row_times
 
     def with_bin_width(self, bin_width: float) -> Streak:
         """Return the same picture with evenly spaced rows of `bin_width` seconds, the first at 0."""

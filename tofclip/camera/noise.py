@@ -93,7 +93,7 @@ class MeasurementNoise:
             lit = light[light[:, frame] > LIT_DEVIATIONS * self.floor, frame]
             usual = float(np.quantile(lit, USUAL_QUANTILE)) if lit.size else 0.0
             dazzling[:, frame] &= light[:, frame] > FRAME_DAZZLE_RATIO * usual
-        return np.asarray(dazzling)
+        return dazzling
 
 
 def find_dazzle_limit(measurement: Measurement, floor: float) -> float:
@@ -123,7 +123,7 @@ def find_glints(operator: LineProjection, dazzled: BoolArray) -> BoolArray:
     weight = transposed @ np.ones(dazzled.shape[0], np.float32)
     share = (transposed @ dazzled.astype(np.float32)).T
     glints = share > MIN_DAZZLED_SHARE * np.maximum(weight, np.finfo(np.float32).tiny)
-    return np.asarray(glints.reshape(-1, *operator.shape_in))
+    return glints.reshape(-1, *operator.shape_in)
 
 
 def _take_brightest_around(light: AnyArray) -> AnyArray:
@@ -131,4 +131,4 @@ def _take_brightest_around(light: AnyArray) -> AnyArray:
     from scipy.ndimage import maximum_filter1d  # reading a shot has to be quick
 
     size = 2 * DAZZLE_REACH_COLUMNS + 1
-    return np.asarray(maximum_filter1d(light, size, axis=0, mode="constant"))
+    return maximum_filter1d(light, size, axis=0, mode="constant")

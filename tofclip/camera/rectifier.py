@@ -198,7 +198,7 @@ class Rectifier:
     def inside(self) -> BoolArray:
         """Where the raw image has what a rectified pixel shows, (rows, columns)."""
         rows, columns = self._raw_row.shape
-        inside: BoolArray = (self._raw_row >= 0) & (self._raw_row <= rows - 1)
+        inside = (self._raw_row >= 0) & (self._raw_row <= rows - 1)
         inside &= (self._raw_column >= 0) & (self._raw_column <= columns - 1)
         return inside
 
@@ -284,7 +284,7 @@ class RowSums:
                 starts.size,
                 lanes,
             )
-            return np.asarray(counts @ np.ones(counts.shape[1], np.float32))
+            return counts @ np.ones(counts.shape[1], np.float32)
 
         def work(piece: slice) -> None:
             ends = piece.start, piece.stop

@@ -93,7 +93,7 @@ def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 def _load_npz_member(path: Path, member: zipfile.ZipInfo) -> AnyArray:
     with BoundedFile(path) as opened, zipfile.ZipFile(opened) as archive:
-        return np.asarray(np.lib.format.read_array(archive.open(member), allow_pickle=False))
+        return np.lib.format.read_array(archive.open(member), allow_pickle=False)
 
 
 def list_mat_entries(path: Path) -> dict[str, ArchiveEntry]:

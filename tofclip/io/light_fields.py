@@ -157,7 +157,7 @@ def _parse_grid_positions(folder: Path, paths: list[Path]) -> IntArray:
         groups.append(found.groups())
     if all(len(group) == 2 for group in groups):
         places = np.array(groups, np.int64)
-        return np.asarray(places - places.min(axis=0))
+        return places - places.min(axis=0)
     numbers = np.array([group[-1] for group in groups], np.int64)
     numbers -= numbers.min()
     # One number says nothing about the width of the grid, so that only a square one is certain.
@@ -187,7 +187,7 @@ def _decode_tiff(path: Path, file: BoundedFile) -> AnyArray:
         if len(tiff.pages) != 1:
             raise FileFormatError(path, f"holds {len(tiff.pages)} pictures, expected one view")
         require_bounded_page(tiff.pages.first, path)
-        return np.asarray(tiff.pages.first.asarray())
+        return tiff.pages.first.asarray()
 
 
 def _decode(path: Path, file: BoundedFile) -> AnyArray:

@@ -208,7 +208,7 @@ def read_scan(events: PtuEvents) -> ScannedPhotons:
         y = lines.row[line]
         if is_back:
             x = np.where(y % 2, columns - 1 - x, x)
-        delay: FloatArray = piece.delay[inside] * np.float64(events.resolution)
+        delay = piece.delay[inside] * np.float64(events.resolution)
         found.append(ScannedPhotons(x.astype(np.uint16), y.astype(np.uint16), delay))
         photons += len(x)
         if photons * PHOTON_BYTES > MAX_SCAN_BYTES:

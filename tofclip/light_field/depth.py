@@ -121,8 +121,8 @@ def compute_modified_laplacian(pictures: Array) -> Array:
     padded = np.pad(pictures, [(0, 0)] * (pictures.ndim - 2) + [(1, 1), (1, 1)], mode="edge")
     middle = 2 * padded[..., 1:-1, 1:-1]
     # absolute values first: second derivatives of opposite sign must not cancel
-    down: Array = np.abs(middle - padded[..., :-2, 1:-1] - padded[..., 2:, 1:-1])
-    across: Array = np.abs(middle - padded[..., 1:-1, :-2] - padded[..., 1:-1, 2:])
+    down = np.abs(middle - padded[..., :-2, 1:-1] - padded[..., 2:, 1:-1])
+    across = np.abs(middle - padded[..., 1:-1, :-2] - padded[..., 1:-1, 2:])
     return down + across
 
 

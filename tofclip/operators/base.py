@@ -363,7 +363,7 @@ class Selection(LinearOperator):
         self._pieces = int(np.prod(shape_in)) * chosen.size // int(np.prod(shape_out))
 
     def _forward(self, block: Array) -> Array:
-        kept: Array = block.reshape(self._pieces, -1)[self._chosen]
+        kept = block.reshape(self._pieces, -1)[self._chosen]
         return kept.reshape(*self.shape_out, -1)
 
     def _adjoint(self, block: Array) -> Array:
@@ -416,7 +416,7 @@ class MeanWeighting(LinearOperator):
 
     def _forward(self, block: Array) -> Array:
         means = np.add.reduceat(block, self._starts, axis=0) / self._counts[:, np.newaxis]
-        weighted: Array = block - np.repeat(self._removed * means, self._counts, axis=0)
+        weighted = block - np.repeat(self._removed * means, self._counts, axis=0)
         return weighted.astype(self.dtype)
 
     def _adjoint(self, block: Array) -> Array:

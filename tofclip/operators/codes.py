@@ -141,7 +141,7 @@ class HadamardCodes(LinearOperator):
         spectrum = np.zeros((padded_columns, padded_rows, batch), self.dtype)
         spectrum[:columns] = signed.swapaxes(0, 1)
         transform_walsh_hadamard(spectrum.reshape(padded_columns, -1))
-        coded: Array = spectrum.reshape(-1, batch)[self._chosen]
+        coded = spectrum.reshape(-1, batch)[self._chosen]
         coded += block.sum(axis=0).sum(axis=0)
         coded /= 2
         return coded
@@ -157,7 +157,7 @@ class HadamardCodes(LinearOperator):
         half_way = spectrum.reshape(padded_columns, padded_rows, batch)[:columns]
         signed = np.ascontiguousarray(half_way.swapaxes(0, 1))
         transform_walsh_hadamard(signed.reshape(padded_rows, -1))
-        pictures: Array = signed[:rows] * self._signs
+        pictures = signed[:rows] * self._signs
         pictures += block.sum(axis=0)
         pictures /= 2
         return pictures
@@ -184,11 +184,11 @@ class WeightedViews(LinearOperator):
     def _forward(self, block: Array) -> Array:
         # One dense product for all pixels and frames: a mask in the aperture treats every pixel
         # alike.
-        seen: Array = self.weights @ block.reshape(len(block), -1)
+        seen = self.weights @ block.reshape(len(block), -1)
         return seen.reshape(*self.shape_out, -1)
 
     def _adjoint(self, block: Array) -> Array:
-        spread: Array = self.weights.T @ block.reshape(len(self.weights), -1)
+        spread = self.weights.T @ block.reshape(len(self.weights), -1)
         return spread.reshape(*self.shape_in, -1)
 
 

@@ -176,11 +176,11 @@ class SparseMatrix(LinearOperator):
 
     def _forward_single(self, picture: Array) -> Array:
         """Apply to a lone array: there are no neighbouring frames to share a vector instruction."""
-        product: Array = self.matrix @ picture.reshape(-1)
+        product = self.matrix @ picture.reshape(-1)
         return product.reshape(self.shape_out)
 
     def _adjoint_single(self, measurements: Array) -> Array:
-        product: Array = self.matrix.T @ measurements.reshape(-1)
+        product = self.matrix.T @ measurements.reshape(-1)
         return product.reshape(self.shape_in)
 
 

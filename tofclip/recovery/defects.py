@@ -167,7 +167,7 @@ def find_dead_columns(counts: Float32Array, noise: float) -> BoolArray:
     rough = changes.mean(axis=0)
     # Of a bright scene the usual column is lit; a column that sees none of it is not dead.
     usual = min(float(np.median(rough)), MEAN_CHANGE * noise)
-    dead: BoolArray = rough < DEAD_COLUMN_FRACTION * usual
+    dead = rough < DEAD_COLUMN_FRACTION * usual
     if not np.median(changes):  # no noise by which a column is known to be alive
         return np.zeros(dead.shape, bool)
     return dead if dead.mean() <= MAX_CONSTANT_FRACTION else np.zeros(dead.shape, bool)

@@ -89,7 +89,7 @@ def _differ(
     )
     # of a square root the variance is a quarter, whatever the mean
     most = (np.abs(change) / np.sqrt(0.25 / first + 0.25 / second)).max(axis=1)
-    return np.asarray((most > limit) & (others > 0))
+    return (most > limit) & (others > 0)
 
 
 class PhotonPipeline:

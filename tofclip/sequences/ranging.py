@@ -183,7 +183,7 @@ def compute_light_curve(streak: Streak, camera: Camera) -> FloatArray:
     half = camera.image_shape[1] // 4
     middle = round(camera.centres_px[reference])
     counts = streak.counts[:, max(0, middle - half) : middle + half + 1]
-    return np.asarray(counts.sum(axis=1, dtype=np.float64))
+    return counts.sum(axis=1, dtype=np.float64)
 
 
 def make_average_cloud(
@@ -218,5 +218,5 @@ def _differentiate_root(light: FloatArray) -> FloatArray:
     """
     # Shot noise of a root of counts is the same at every level, so that no row dominates.
     rise = np.diff(np.sqrt(np.maximum(light - np.median(light), 0)), prepend=0.0)
-    length: float = float(np.linalg.norm(rise)) or 1.0
+    length = float(np.linalg.norm(rise)) or 1.0
     return rise / length

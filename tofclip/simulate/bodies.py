@@ -161,7 +161,7 @@ class Lambertian:
         `normal` of the surface and `light` towards the lamp have length 1, `directions` towards the
         surface any.
         """
-        lit: Array = AMBIENT_FRACTION + (1 - AMBIENT_FRACTION) * np.maximum(normal @ light, 0)
+        lit = AMBIENT_FRACTION + (1 - AMBIENT_FRACTION) * np.maximum(normal @ light, 0)
         return self.reflectance(place) * lit
 
 
@@ -180,7 +180,7 @@ class Specular(Lambertian):
         matt = super().radiance(place, normal, directions, light)
         unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         mirrored = unit - 2 * np.einsum("ij,ij->i", unit, normal)[:, np.newaxis] * normal
-        shine: Array = self.gloss * np.maximum(mirrored @ light, 0) ** self.exponent
+        shine = self.gloss * np.maximum(mirrored @ light, 0) ** self.exponent
         return matt + shine
 
 
@@ -324,7 +324,7 @@ def number_ray_pixels(image_shape: tuple[int, int], rays_per_side: int) -> Index
 
 def accumulate_cells(cell: IndexArray, amount: Array, shape: tuple[int, ...]) -> Array:
     """Add each amount to its cell, numbered in raster order, of a float64 array of `shape`."""
-    total: Any = np.bincount(cell.ravel(), amount.ravel(), minlength=int(np.prod(shape)))
+    total = np.bincount(cell.ravel(), amount.ravel(), minlength=int(np.prod(shape)))
     return np.asarray(total, dtype=np.float64).reshape(shape)
 
 

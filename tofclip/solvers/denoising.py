@@ -43,7 +43,7 @@ class NonlocalMeans:
         """Return the picture without its noise, see `Denoiser`; the pilot is not needed."""
         from skimage.restoration import denoise_nl_means
 
-        clean: Picture = denoise_nl_means(
+        clean = denoise_nl_means(
             noisy,
             patch_size=self.patch_px,
             patch_distance=self.reach_px,
@@ -230,7 +230,7 @@ def solve_data_step(
     weights = misfit.weights(predicted)[:, 0]
 
     solution = anchor.copy()
-    residual: Array = -operator.adjoint(misfit.gradient(predicted)[:, 0])
+    residual = -operator.adjoint(misfit.gradient(predicted)[:, 0])
     direction = residual.copy()
     energy = float(np.vdot(residual, residual))
     for _ in range(iterations):

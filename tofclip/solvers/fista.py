@@ -109,7 +109,7 @@ class Fista:
         self.seen, self._seen_before = (
             zeros((*operator.shape_out, frames), data_term.measurements) for _ in range(2)
         )
-        self.objective: Array = data_term.value(self.seen)
+        self.objective = data_term.value(self.seen)
         self._age = namespace(self.objective).ones_like(self.objective)
         self._level = namespace(self.objective).zeros_like(self.objective)
         self._level_before = self._level
