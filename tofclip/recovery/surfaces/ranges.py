@@ -54,8 +54,9 @@ ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 12, 4
 # wires were 0.009 mm too near, without noise and with the model exact; after 15, 0.0005 mm.
 FREE_ITERATIONS, FURTHER_FREE_ITERATIONS, MOVED_FREE_ITERATIONS = 15, 6, 3
 # Of local shifts: the side of the square that moves together, the least that is known of one,
-# 1/m^2: a metre, and variances of its noise that show nothing.
-LOCAL_PX, LEAST_INFORMATION, SHIFT_NOISE = 3, 1.0, 2.0
+# 1/m^2: a metre, variances of its noise that show nothing, and what is left of the information of all
+# points alone where it cancels.
+LOCAL_PX, LEAST_INFORMATION, SHIFT_NOISE, CANCELLED = 3, 1.0, 2.0, 0.1
 Unknown = tuple[str, int, int]
 RIDGE = 1e-6  # of each unknown's own information: for what the shot says nothing about
 
@@ -423,10 +424,18 @@ def measure_local_shifts(model: SurfaceModel, amplitude: Image, rest: Image) -> 
             LOCAL_PX**2 * scipy.ndimage.uniform_filter(one, LOCAL_PX, mode="constant")[mask]
             for one in pictures
         )
-        # where a surface is steep, what neighbours that move along say cancels
+        variance = np.maximum(variance, LEAST_INFORMATION)
         weight = np.maximum(np.abs(weight), LEAST_INFORMATION)
-        noise = np.minimum(SHIFT_NOISE * variance / weight**2, 1 / weight)
-        shifts[part] = np.sqrt(np.maximum(np.minimum(np.abs(near) / weight, most) ** 2 - noise, 0))
+        squares, noise = np.minimum(np.abs(near) / weight, most) ** 2, variance / weight**2
+        # where a surface is steep, what neighbours that move along say cancels: there it is taken to be
+        # as far off as elsewhere, where it is seen best, and three deviations of that. Of a square of a
+        # normal error the variance is 2 noise^2, and neighbours share theirs
+        sure = np.where(amplitude[part] > 0, noise**-2, 0)
+        total = max(float(np.sum(sure)), TINY)
+        usual = max(np.sum(sure * (squares - noise)) / total, 0)
+        usual += 3 * np.sqrt(2 * LOCAL_PX**2 / total)
+        own = np.maximum(squares - np.minimum(SHIFT_NOISE * noise, 1 / weight), 0)
+        shifts[part] = np.sqrt(np.where(weight < CANCELLED * variance, usual, own))
     return shifts
 
 
