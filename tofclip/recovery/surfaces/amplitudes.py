@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -21,16 +20,10 @@ NORM_ITERATIONS, FURTHER_NORM_ITERATIONS = 10, 2
 NORM_MARGIN = 1.1
 EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
-# Of light that was spread beyond its surface: rounds of taking a border off and iterations in each; the
-# deviations from which on a border is needed, and by which it would be missed if nothing took its light;
-# the part of the usual brightness below which light was spread; the part of the points of which as few
-# are not that no further round is worth it; how much brighter the inside has to become by that light, or
-# of the brightness inside what a pixel has at most that is hardly filled
-BORDER_ROUNDS, TAKING_ITERATIONS, FURTHER_TAKING_ITERATIONS = 8, 30, 15
-NEEDED_SIGMAS, MISSED_SIGMAS, DIM_FRACTION, FEW_POINTS = 4.0, 8.0, 0.75, 0.0005
-GAINED_RATIO, HARDLY_FILLED = 1.1, 0.35
-# Sides of squares: of a place's brightness, and of light that stays there as it spreads
-FILLED_PX, SPREAD_PX = 3, 31
+# Of light beside brighter light of its surface: the sides of the squares whose mean is a place's brightness
+# and in which the brightest counts, the part of that below which a place is dim, and after how many
+# iterations what is dim is looked for anew
+PLACE_PX, BESIDE_PX, DIM_PART, REWEIGHT_ITERATIONS = 3, 15, 0.75, 10
 MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 TINY = float(np.finfo(np.float32).tiny)
@@ -113,81 +106,19 @@ class AmplitudeSolver:
             found[part] = work(*pictures)[lit]
         return found
 
-    def find_spread(self, shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Say which of the points `shown`, (points,), have light that belongs further inside.
+    def run(self, iterations: int, tick: Tick = lambda: None, against_dim: float = 0.0) -> None:
+        """Take some steps, with a call of `tick` after each.
 
-        The light of a line of one range that runs level may lie anywhere in a lens about it: no view
-        tells, and the prior favours the lens, which is dimmer. From the borders inwards such points are
-        found: the whole shot is explained as well without them and all that lie outside, those inside
-        free to take over the light (`explain_by_amplitude`), and with that light inside their
-        surface is still dimmer than beside the nearest border that the shot needs. What hardly
-        makes it brighter was not spread: a surface is dark there, unless its border alone is.
-        Nothing is known of light so weak that it would not be missed.
+        Light of a line of one range that runs level may lie anywhere in a lens about it: no view tells,
+        and total variation favours the lens, which is dimmer. `against_dim` is what light costs at places
+        that are dark beside the brightest of their surface nearby, in standard deviations as `weight`
+        (reweighted l1, E. Candes and others, J. Fourier Anal. Appl. 14, 877, 2008): the lens gives way
+        from its border inwards, and what the shot needs stays.
         """
-        model = copy.copy(self.model)
-        model.weights = model.weights / self.estimate_local_variance()
-        amplitude, left = self.amplitude, shown.copy()
-        taken, usual = np.zeros_like(amplitude), np.zeros(shown.size)
-
-        def average(values: NDArray[Any], side: int) -> FloatArray:
-            mean = partial(scipy.ndimage.uniform_filter, size=side, mode="constant")
-            return self.map_pictures(mean, values.astype(np.float64))
-
-        def sum_near(light: Image, seen: Image) -> FloatArray:
-            """What some light about each point says of how much worse the shot is explained."""
-            own = light * model.gather(model.weights * seen)
-            return NEIGHBOURHOOD_PX**2 * average(own, NEIGHBOURHOOD_PX)
-
-        # how bright the surface is inside, where no pixel is only partly filled
-        light = np.where(shown, amplitude, np.float32(0))
-        bright = average(light, FILLED_PX) / np.maximum(average(shown, FILLED_PX), TINY)
-        largest = partial(scipy.ndimage.maximum_filter, size=NEIGHBOURHOOD_PX, mode="constant")
-        bright = self.map_pictures(largest, np.where(shown, bright, 0))
-        around = average(light, SPREAD_PX)
-        for number in range(BORDER_ROUNDS):
-            inside = np.zeros_like(model.masks)
-            inside[model.masks] = left
-            inside &= [scipy.ndimage.binary_erosion(one, border_value=1) for one in inside]
-            free = inside[model.masks]
-            border, without = left & ~free, np.where(free, np.float32(0), light)
-            taken = np.where(free, taken, np.float32(0))
-            iterations = FURTHER_TAKING_ITERATIONS if number else TAKING_ITERATIONS
-            image = model.render(without - taken)
-            taken += explain_by_amplitude(model, image, scale_amplitude(model, free), iterations)
-            # at the best that is free these add up to what the shot is explained worse by
-            needed = sum_near(without, model.render(without - taken)) > NEEDED_SIGMAS**2
-            missed = sum_near(without, model.render(without)) > MISSED_SIGMAS**2
-            if number == 0:
-                usual = self._spread_from(border & needed, bright)
-            gained = around / np.maximum(average(light * left, SPREAD_PX), TINY)
-            idle = border & ~needed & missed
-            idle &= bright * gained < DIM_FRACTION * usual
-            left &= ~idle
-            if idle.sum() <= FEW_POINTS * left.sum():
-                break
-        gained = around / np.maximum(average(light * left, SPREAD_PX), TINY)
-        faint = amplitude < HARDLY_FILLED * bright
-        return shown & ~left & (faint | (gained > GAINED_RATIO))
-
-    def _spread_from(self, known: NDArray[np.bool_], values: FloatArray) -> FloatArray:
-        """What the nearest point of the surface among those that are known has; 0 where none is."""
-
-        def spread(picture: FloatArray) -> FloatArray:
-            if not picture.any():
-                return picture
-            nearest = scipy.ndimage.distance_transform_edt(
-                picture == 0, return_distances=False, return_indices=True
-            )
-            return np.asarray(picture[tuple(nearest)])
-
-        return self.map_pictures(spread, np.where(known, values, 0))
-
-    def run(self, iterations: int, tick: Tick = lambda: None) -> None:
-        """Take some steps, with a call of `tick` after each."""
         model = self.model
         steps = 1 / (NORM_MARGIN * self._estimate_norms())
         # The gradient A'W(A a - y) has the covariance A'WA times a weighted measurement's variance.
-        information = self.variance * model.gather(model.weights, squared=True)
+        information = np.maximum(self.variance * model.gather(model.weights, squared=True), 0)
         noise = np.array(
             [
                 np.sqrt(np.median(information[part])) if part.stop > part.start else 1.0
@@ -196,12 +127,12 @@ class AmplitudeSolver:
         )
         weights = self.weight * noise
         step = steps[model.surface].astype(np.float32)
-        ahead, age = self.amplitude, 1.0
-        for _ in range(iterations):
-            error = model.render(ahead) - model.image
-            moved = self._shrink(
-                ahead - step * model.gather(model.weights * error), weights * steps
-            )
+        ahead, age, cost = self.amplitude, 1.0, np.zeros_like(step)
+        for number in range(iterations):
+            if against_dim and number % REWEIGHT_ITERATIONS == 0:
+                cost = np.float32(against_dim) * np.sqrt(information) * self._find_dim()
+            slope = model.gather(model.weights * (model.render(ahead) - model.image)) + cost
+            moved = self._shrink(ahead - step * slope, weights * steps)
             if np.sum((ahead - moved) * (moved - self.amplitude)) > 0:
                 age = 1.0  # the momentum points uphill (O'Donoghue and Candes, 2015)
             older = (1 + np.sqrt(1 + 4 * age**2)) / 2
@@ -209,6 +140,14 @@ class AmplitudeSolver:
             self.amplitude, age = moved, older
             tick()
         self.variance = estimate_excess_variance(model, self.amplitude)
+
+    def _find_dim(self) -> Image:
+        """By how much each point is dimmer than the brightest of its surface beside it, 0 to 1."""
+        mean = partial(scipy.ndimage.uniform_filter, size=PLACE_PX, mode="constant")
+        largest = partial(scipy.ndimage.maximum_filter, size=BESIDE_PX, mode="constant")
+        bright = self.map_pictures(mean, self.amplitude)
+        usual = np.maximum(np.float32(DIM_PART) * self.map_pictures(largest, bright), TINY)
+        return np.asarray(np.clip(1 - bright / usual, 0, 1))
 
     def _estimate_norms(self) -> FloatArray:
         """Largest eigenvalue of A'WA for each surface, by power iteration."""

@@ -39,6 +39,7 @@ from tofclip.threads import limit_blas_threads
 
 START_ITERATIONS = 25
 MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 4, 10
+AGAINST_DIM = 3.0  # until ranges are known; then amplitudes are as the shot has them
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
 LAST_STEP_SIGMAS = 0.3
 # Where the last shot's fit begins: before and after the ranges' step, and how far beyond the returns
@@ -116,7 +117,7 @@ def _fit_returns(
     solver = find_surfaces(found, streak, frames, weight)
 
     # 4. Amplitudes.
-    solver.run(START_ITERATIONS, tick)
+    solver.run(START_ITERATIONS, tick, AGAINST_DIM)
     limit = np.hypot(MAX_UNEXPLAINED, estimate_darkness(streak, frames))
     if solver.model.unexplained(solver.amplitude) > limit:
         # what is too small for a surface may be all that is bright
@@ -259,12 +260,13 @@ def _refine(
         model.find_behind(solver.amplitude)
         found = refine_state(model, solver.amplitude, found, number + 1 >= MIN_REFINEMENTS)
         solver.amplitude = found.amplitude
-        solver.run(REFINEMENT_ITERATIONS, tick)
+        solver.run(REFINEMENT_ITERATIONS, tick, AGAINST_DIM)
         moved = model.distance - before
         # where a surface is dark, it may go anywhere
         light = solver.amplitude + np.finfo(np.float32).tiny
         lengths.append([np.sqrt(np.average(moved[p] ** 2, weights=light[p])) for p in model.parts])
-        sigmas = moved / model.estimate_deviation(found.covariances)
+        lit = solver.amplitude > 0
+        sigmas = moved[lit] / model.estimate_deviation(found.covariances)[lit]
         if number + 1 >= MIN_REFINEMENTS and np.sqrt(np.mean(sigmas**2)) < LAST_STEP_SIGMAS:
             break
     assert found is not None

@@ -12,6 +12,7 @@ from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.lidar import Detection
 from tofclip.lidar.range_calibration import correct_returns
+from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.fit import SURE_SIGMAS, SurfaceFit, find_candidates, find_near
 from tofclip.recovery.surfaces.patches import rank_within_pixels
 from tofclip.recovery.surfaces.ranges import measure_local_shifts
@@ -20,11 +21,13 @@ from tofclip.shots import Returns
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
-# Logarithm of the odds that a surface's point is false: nothing known, for each e-fold of its
-# significance over 20, where the frames have returns beside all points about it, and where its light
-# belongs further inside. From scenes of known returns (tests/lidar/physics_scenes.py); docs tell what
-# they miss.
-FALSE_ODDS = np.array([0.95, -0.73, -5.27, 2.35])
+# Logarithm of the odds that a surface's point is false: nothing known, for each e-fold over 20 of its
+# significance where dim light beside bright is costly, and where the frames have returns beside all
+# points about it. From scenes of known returns (tests/lidar/physics_scenes.py); docs tell what they miss.
+FALSE_ODDS = np.array([0.72, -0.78, -4.63])
+# What such light costs, in deviations, and for how many iterations: first it gives way, then what the
+# shot needs comes back. A significance of less than the last counts as that.
+AGAINST_DIM, LEAST_SIGMAS = ((4.0, 100), (2.0, 20)), 0.1
 ABOUT_PX = 5  # side of the square
 
 # Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
@@ -66,7 +69,9 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
     rounded = np.zeros(distance.size)
     for surface in np.unique(model.surface[chosen]):
         own = model.surface[chosen] == surface
-        if own.sum() < ROD_FRACTION * (np.ptp(y[own]) ** 2 + np.ptp(x[own]) ** 2):
+        # points that may be false fill a part
+        filled = np.sum(1 - doubt[strong][own])
+        if filled < ROD_FRACTION * (np.ptp(y[own]) ** 2 + np.ptp(x[own]) ** 2):
             rounded[chosen[own]] = ROD_PX * distance[chosen[own]] / camera.focal_length_px
     parts = np.stack([fitted, fit.remainder[model.surface], *moved, bent, rounded])
     deviation = np.sqrt(np.sum(parts**2, axis=0) + model.estimate_sweep_error() ** 2)
@@ -96,22 +101,23 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
 
 
 def _judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
-    """Numbers of the candidates among the points, and how probable it is that each is false. Where light
-    was spread beyond its surface, frames spread it as well: their returns say nothing there.
+    """Numbers of the candidates among the points, and how probable it is that each is false: the shot is
+    explained once more with dim light only where it needs it.
     """
     solver, model, seen = fit.solver, fit.solver.model, fit.seen
-    shown, significance = find_candidates(solver, limit)
+    shown, _ = find_candidates(solver, limit)
+    sparse = AmplitudeSolver(model, solver.amplitude, solver.weight, solver)
+    for sigmas, iterations in AGAINST_DIM:
+        sparse.run(iterations, against_dim=sigmas)
+    significance = sparse.measure_significance(solver.estimate_local_variance())[shown]
     points = model.row[shown], model.column[shown], model.distance[shown]
     candidates, confirmed = shown.astype(np.float64), np.zeros(shown.size)
     confirmed[shown] = find_near(points, (seen.y, seen.x, seen.range), model.row_m)
     mean = partial(scipy.ndimage.uniform_filter, size=ABOUT_PX, mode="constant")
     about, near = (solver.map_pictures(mean, one)[shown] for one in (confirmed, candidates))
-    about /= near
-    spread = solver.find_spread(shown)[shown]
-    known = [np.log(significance[shown] / SURE_SIGMAS), np.where(spread, 0, about), spread]
-    return np.flatnonzero(shown), scipy.special.expit(
-        FALSE_ODDS[0] + FALSE_ODDS[1:] @ np.array(known)
-    )
+    known = [np.log(np.maximum(significance, LEAST_SIGMAS) / SURE_SIGMAS), about / near]
+    odds = FALSE_ODDS[0] + FALSE_ODDS[1:] @ np.array(known)
+    return np.flatnonzero(shown), scipy.special.expit(odds)
 
 
 def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
