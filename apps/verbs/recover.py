@@ -202,7 +202,8 @@ def recover(
         plan = plan_recovery(shot, solver, chosen_focus, device)
     # An instrument's address is no file with a checksum.
     inputs = [Path(one) for one in (streak, camera) if one is not None and "://" not in str(one)]
-    with show_progress("recovering", plan.work) as advance:
+    memory = f"about {plan.memory_bytes / 1e9:.1f} GB of memory"
+    with show_progress(f"recovering, {memory}", plan.work) as advance:
         frames = plan.add_provenance(plan.run(advance), *inputs)
     with show_activity("writing"):
         from apps.figures.shot import make_preview_figure
