@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -113,7 +113,11 @@ class BackprojectionPlan(PhasorPlan):
         super().__init__(capture, grid)
         self.band, self.weighting = Band(method.pulse, capture.axis), method.weighting
         pulse = {"wavelength_m": method.wavelength, "cycles": method.cycles}
-        self.settings: dict[str, Any] = {"method": "backprojection", **pulse}
+        self.settings: dict[str, Any] = {
+            "method": "backprojection",
+            **pulse,
+            **asdict(method.weighting),
+        }
         self.cost = len(capture.points) * grid.size  # look-ups
         self.memory_bytes += TABLE_COPIES * TABLE_BYTES
 
@@ -293,7 +297,8 @@ class FilteredBackprojectionPlan(Plan):
         samples = capture.axis.bins + sum(PADDING_SAMPLES)
         total = backproject_signals(capture, grid, pad_signals, samples, method.weighting, progress)
         sharpened = _apply_laplacian(np.ascontiguousarray(total.real), grid, method.sigma)
-        settings = {"method": "filtered backprojection", "sigma_m": method.sigma}
+        named = {"method": "filtered backprojection", "sigma_m": method.sigma}
+        settings = named | asdict(method.weighting)
         history = {**capture.provenance, "imaging": settings}
         return Volume(np.maximum(sharpened, 0), grid, history)
 

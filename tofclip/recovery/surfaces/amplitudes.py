@@ -130,7 +130,7 @@ class AmplitudeSolver:
         ahead, age, cost = self.amplitude, 1.0, np.zeros_like(step)
         for number in range(iterations):
             if against_dim and number % REWEIGHT_ITERATIONS == 0:
-                cost = np.float32(against_dim) * np.sqrt(information) * self._find_dim()
+                cost = self._cost_dim(against_dim, np.sqrt(information))
             slope = model.gather(model.weights * (model.render(ahead) - model.image)) + cost
             moved = self._shrink(ahead - step * slope, weights * steps)
             if np.sum((ahead - moved) * (moved - self.amplitude)) > 0:
@@ -141,13 +141,17 @@ class AmplitudeSolver:
             tick()
         self.variance = estimate_excess_variance(model, self.amplitude)
 
-    def _find_dim(self) -> Image:
-        """By how much each point is dimmer than the brightest of its surface beside it, 0 to 1."""
+    def _cost_dim(self, sigmas: float, noise: Image) -> Image:
+        """What light costs at each point for being dimmer than the brightest of its surface beside it:
+        so many deviations, `noise`, where it is dark, but no more than the brightest is out of the noise
+        itself: in little light nothing would be left.
+        """
         mean = partial(scipy.ndimage.uniform_filter, size=PLACE_PX, mode="constant")
         largest = partial(scipy.ndimage.maximum_filter, size=BESIDE_PX, mode="constant")
         bright = self.map_pictures(mean, self.amplitude)
         usual = np.maximum(np.float32(DIM_PART) * self.map_pictures(largest, bright), TINY)
-        return np.asarray(np.clip(1 - bright / usual, 0, 1))
+        dim = np.clip(1 - bright / usual, 0, 1)
+        return np.asarray(dim * noise * np.minimum(np.float32(sigmas), noise * usual))
 
     def _estimate_norms(self) -> FloatArray:
         """Largest eigenvalue of A'WA for each surface, by power iteration."""

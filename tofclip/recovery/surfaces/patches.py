@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.lidar.search import number_returns
 from tofclip.recovery.surfaces.shapes import (
-    FITTED_RETURNS,
     SPLINE_DEGREE,
     TINY,
     Pixels,
@@ -48,6 +47,7 @@ MERGE_REACH_BINS, MERGE_REACH_MISFITS = 7.0, 5.0
 SPLIT_BINS, SPLIT_SIGMAS = 4.0, 3.0
 MERGE_SIGMAS = 1.0  # median; 0.67 are expected of returns of the surface
 FIT_ITERATIONS = 10
+FITTED_RETURNS = 2000  # of a patch, evenly chosen: with more a start is no better
 RIDGE = 1e-9  # per return: those along a line say nothing about what is across it
 CURVATURE_PENALTY = 1e-3  # keeps small patches from bending
 FLAT_PENALTY = 1e3  # keeps all from it: a bent one would follow what stands on it

@@ -30,9 +30,7 @@ TINY = float(np.finfo(np.float32).eps)
 # is sqrt(q) at the pixel's middle, of which as much is rounded off.
 LIMB = 0.44
 LIMB_LEVELS = np.array([1.0, 1.5, 2.0, 3.0, 5.0])
-# Of a robust fit: rounds and steps in each at most; a scale of errors that changed by less is the last
-FIT_ROUNDS, FIT_STEPS, SAME_SCALE = 8, 30, 0.02
-FITTED_RETURNS = 2000  # evenly chosen: with more a start is no better
+FIT_ROUNDS, FIT_STEPS = 8, 30
 
 
 @dataclass(frozen=True)
@@ -181,8 +179,7 @@ def fit_quadric(
     ends = corners.min(axis=1), corners.max(axis=1) + 1
     middle, unit = float(np.median(inverse)), float(np.std(inverse)) + TINY
     basis = QuadricBasis(image_shape, tuple(np.concatenate(ends).tolist()), unit=unit)
-    some = slice(None, None, 1 + pixels.size // FITTED_RETURNS)
-    inverse, functions = inverse[some], basis.evaluate(pixels[some])
+    functions = basis.evaluate(pixels)
     plain, *_ = np.linalg.lstsq(functions, inverse)
     # what bulges towards the camera has its greatest inverse depth in the middle
     basis = replace(basis, sign=1.0 if plain[3] + plain[5] < 0 else -1.0)
@@ -202,11 +199,8 @@ def fit_quadric(
         starts.append(np.concatenate([[limb, 0, 0], q]))
     found = min(starts, key=lambda one: float(np.median(np.abs(measure(one)))))
     # frames' returns at a limb are far too near, all of them: what the others do not share hardly counts
-    scale = np.inf
     for _ in range(FIT_ROUNDS):
-        before, scale = scale, float(np.median(np.abs(measure(found)))) + TINY
-        if abs(scale - before) < SAME_SCALE * scale:
-            break
+        scale = float(np.median(np.abs(measure(found)))) + TINY
         settings = {"loss": "arctan", "f_scale": scale, "x_scale": "jac", "max_nfev": FIT_STEPS}
         found = scipy.optimize.least_squares(measure, found, differentiate, **settings).x
     return basis, found
