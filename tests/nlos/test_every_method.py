@@ -58,13 +58,16 @@ pulsed_methods = pytest.mark.parametrize("make", PULSED.values(), ids=PULSED.key
 
 PULSE = {"wavelength_m": 0.125, "cycles": 3.0}
 SETTINGS = {
-    "backprojection": (Backprojection(0.125), PULSE),
+    "backprojection": (Backprojection(0.125), {**PULSE, "falloff": 1.0, "obliquity": 0.0}),
     "rsd": (PlanarRSD(0.125), {**PULSE, "tolerance": 1e-2}),
     "hybrid": (
         Hybrid(0.125, plane_z=0.1),
         {**PULSE, "tolerance": 1e-2, "propagation": "spectral", "plane_z_m": 0.1},
     ),
-    "filtered backprojection": (FilteredBackprojection(0.05), {"sigma_m": 0.05}),
+    "filtered backprojection": (
+        FilteredBackprojection(0.05),
+        {"sigma_m": 0.05, "falloff": 0.0, "obliquity": 0.0},
+    ),
     "lightcone": (LightCone(), {"falloff": 4.0, "signal_to_noise": 0.8}),
     "fk": (FKMigration(), {"falloff": 4.0}),
 }
