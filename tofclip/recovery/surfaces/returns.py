@@ -27,7 +27,7 @@ from tofclip.units import SPEED_OF_LIGHT
 FALSE_ODDS = np.array([0.72, -0.78, -4.63])
 # What such light costs, in deviations, and for how many iterations: first it gives way, then what the
 # shot needs comes back. A significance of less than the last counts as that.
-AGAINST_DIM, LEAST_SIGMAS = ((4.0, 100), (2.0, 20)), 0.1
+JUDGED_AGAINST_DIM, LEAST_SIGMAS = ((4.0, 100), (2.0, 20)), 0.1
 ABOUT_PX = 5  # side of the square
 
 # Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
@@ -107,7 +107,7 @@ def _judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
     solver, model, seen = fit.solver, fit.solver.model, fit.seen
     shown, _ = find_candidates(solver, limit)
     sparse = AmplitudeSolver(model, solver.amplitude, solver.weight, solver)
-    for sigmas, iterations in AGAINST_DIM:
+    for sigmas, iterations in JUDGED_AGAINST_DIM:
         sparse.run(iterations, against_dim=sigmas)
     significance = sparse.measure_significance(solver.estimate_local_variance())[shown]
     points = model.row[shown], model.column[shown], model.distance[shown]

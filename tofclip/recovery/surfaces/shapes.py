@@ -12,6 +12,7 @@ range is steeper there than any polynomial or spline.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -38,7 +39,7 @@ class SmoothBasis:
     """Smooth functions over the picture, of which a surface's inverse depth is a sum."""
 
     image_shape: tuple[int, int]
-    # first row and column, and those after the last, over which splines run
+    # first row and column, and those after the last, over which splines run or a quadric is scaled
     box: tuple[int, int, int, int] = (0, 0, 0, 0)
     # of the splines along rows and columns; without any it is the six monomials of a quadratic
     pieces: tuple[int, int] = (0, 0)
@@ -94,8 +95,11 @@ class SmoothBasis:
 def evaluate_monomials(pixels: Pixels, image_shape: tuple[int, int]) -> FloatArray:
     """Return 1, x, y, x^2, xy and y^2 of pixels, (n, 6), in halves of the picture from its middle."""
     y, x = np.divmod(pixels, image_shape[1])
-    down, right = 2 * y / image_shape[0] - 1, 2 * x / image_shape[1] - 1
-    return np.stack([np.ones_like(x), right, down, right**2, right * down, down**2], axis=-1)
+    return _stack_monomials(2 * x / image_shape[1] - 1, 2 * y / image_shape[0] - 1)
+
+
+def _stack_monomials(x: FloatArray, y: FloatArray) -> FloatArray:
+    return np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -118,8 +122,8 @@ class QuadricBasis(SmoothBasis):
         """Return the monomials at some pixels, (pixels, 6)."""
         row, column = np.divmod(pixels, self.image_shape[1])
         (top, left), (high, wide) = self.box[:2], self._measure_box()
-        y, x = 2 * (row - top + 0.5) / high - 1, 2 * (column - left + 0.5) / wide - 1
-        return np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=-1)
+        x, y = 2 * (column - left + 0.5) / wide - 1, 2 * (row - top + 0.5) / high - 1
+        return _stack_monomials(x, y)
 
     def split_quadratic(self) -> tuple[FloatArray, FloatArray]:
         """No quadratic follows a limb: all functions count on their own, (9, 9)."""
@@ -129,19 +133,24 @@ class QuadricBasis(SmoothBasis):
         return self.box[2] - self.box[0], self.box[3] - self.box[1]
 
     def compute_inverse(self, functions: FloatArray, coefficients: FloatArray) -> FloatArray:
-        root, _ = self._take_root(functions, coefficients)
+        inside, *_ = self._round_off(functions, coefficients)
+        root = np.sqrt(inside / 2)
         return np.asarray(functions[:, :LINEAR] @ coefficients[:LINEAR] + self.sign * root)
 
     def differentiate(self, functions: FloatArray, coefficients: FloatArray) -> FloatArray:
-        _, by_q = self._take_root(functions, coefficients)
+        inside, size, change, slopes, ways = self._round_off(functions, coefficients)
+        across, down = (slope[:, None] * way for slope, way in zip(slopes, ways, strict=True))
+        by_limb = LIMB * (across + down) / change[:, None]
+        by_q = (inside / size)[:, None] * (2 * self.unit * functions)
+        by_q += (LIMB * change / size)[:, None] * by_limb
+        by_q /= (4 * np.sqrt(inside / 2))[:, None]
         return np.concatenate([functions[:, :LINEAR], self.sign * by_q], axis=1)
 
-    def _take_root(
-        self, functions: FloatArray, coefficients: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """The root of q, (pixels,), and its derivative by q's coefficients, (pixels, 6)."""
-        own = coefficients[LINEAR:]
-        functions = 2 * self.unit * functions
+    def _round_off(self, functions: FloatArray, coefficients: FloatArray) -> tuple[Any, ...]:
+        """Twice the square of the root, which is q inside and rounded off at the limb; its size there;
+        by how much q changes over a pixel; its slopes, and their derivatives by q's coefficients.
+        """
+        own, functions = coefficients[LINEAR:], 2 * self.unit * functions
         q = functions @ own
         one, x, y = functions[:, :LINEAR].T
         none, (high, wide) = np.zeros_like(x), self._measure_box()
@@ -151,12 +160,9 @@ class QuadricBasis(SmoothBasis):
         change = np.hypot(*slopes) + np.finfo(np.float64).tiny
         limb = LIMB * change
         size = np.hypot(q, limb)
-        # twice what is left of q, without the difference of large numbers beyond the limb
+        # without the difference of large numbers beyond the limb
         inside = np.where(q > 0, q + size, limb**2 / (size + np.abs(q)))
-        root = np.sqrt(inside / 2)
-        by_limb = LIMB * (slopes[0][:, None] * right + slopes[1][:, None] * down) / change[:, None]
-        by_q = (inside / size)[:, None] * functions + (limb / size)[:, None] * by_limb
-        return root, by_q / (4 * root)[:, None]
+        return inside, size, change, slopes, (right, down)
 
 
 @dataclass(frozen=True)
