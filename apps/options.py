@@ -22,7 +22,7 @@ import tomli_w
 import typer
 
 from tofclip.errors import InputError, StorageError
-from tofclip.files import atomic_path, read_toml, suggest_name
+from tofclip.files import PICTURE_SUFFIXES, atomic_path, read_toml, suggest_name
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
@@ -30,6 +30,12 @@ if TYPE_CHECKING:
 
 UNITS = {"mm": MILLIMETRE, "ns": NANOSECOND, "ps": PICOSECOND}
 """By the last word of an option's name."""
+
+
+def name_any(names: Iterable[str]) -> str:
+    """Name things of which one is chosen: "a, b or c"."""
+    *others, last = names
+    return f"{', '.join(others)} or {last}"
 
 
 def make_completer(names: Iterable[str]) -> Callable[[str], list[str]] | None:
@@ -104,7 +110,7 @@ TIME_ZERO = opt(
 )
 CAMERA = opt("H5", "Made by calibrate.", shown="the one inside the shot")
 FOCUS = opt("SHEAR", "depth-locked or fixed:S.", "fixed:0")
-PICTURE_FORMATS = ".png, .pdf or .svg"
+PICTURE_FORMATS = name_any(PICTURE_SUFFIXES)
 PREVIEW = opt("PNG", f"Where the picture goes: {PICTURE_FORMATS}.", shown="beside --out, .png")
 TOPIC = opt(
     "NAME", "Of the ROS 2 messages.", shown="/tofclip/points; of a bag that is read, its only one"

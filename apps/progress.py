@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from apps.report import may_replace, name_options, report
+from apps.report import may_replace, name_options, report, say
 from tofclip.errors import MissingDependencyError
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ def report_summary(
     summary: Summary, total: int, as_json: bool, out: Path, figures: Mapping[str, Any] | None = None
 ) -> None:
     """Print the figures of a sequence and its failures; `total`: of all its jobs."""
-    failed = {one.name: name_options(one.problem) for one in summary.failures}
+    failed = list_failures(summary)
     figures = {
         "results": summary.done,
         "kept_from_before": total - summary.done - len(failed),
@@ -207,8 +207,17 @@ def report_summary(
         listed = [{"name": name, "problem": problem} for name, problem in failed.items()]
         figures |= {"failures": listed}
     report(figures, as_json, [out])
-    if not as_json:
-        for name, problem in failed.items():
-            print(f"failed: {name}: {problem}", file=sys.stderr)
+    end_with(failed)
+
+
+def list_failures(summary: Summary) -> dict[str, str]:
+    """Return why jobs failed, by their names."""
+    return {one.name: name_options(one.problem) for one in summary.failures}
+
+
+def end_with(failed: Mapping[str, str]) -> None:
+    """Say what failed, and let the exit status say that something did."""
+    for name, problem in failed.items():
+        say("failed", f"{name}: {problem}")
     if failed:
         raise typer.Exit(EXIT_SOME_FAILED)

@@ -38,9 +38,7 @@ SOURCES = Parts(
         "sim+timetag": "devices.emulation.timetag:open_timetag",
         # by the ending of the file that ``file://PATH`` names, lower case
         ".dat": "devices.linospad2:open_recording",
-        ".img": "devices.files:open_streak_file",
-        ".tif": "devices.files:open_streak_file",
-        ".tiff": "devices.files:open_streak_file",
+        ".tif": "devices.files:open_streak_file",  # and every other one, if a reader knows the content
         ".phu": "devices.files:open_phu",
         ".ptu": "devices.files:open_ptu",
         ".sdt": "devices.files:open_sdt",
@@ -126,10 +124,10 @@ def open_parsed(uri: Uri) -> Source:
     """As `open`, of an address that was taken apart already."""
     is_file = uri.scheme == "file"
     name = Path(uri.location).suffix.lower() if is_file else uri.scheme
+    if is_file and name not in SOURCES:
+        name = ".tif"
     if name not in SOURCES or name.startswith(".") != is_file:
         said = f"no source is called '{name}'; known are {', '.join(list_schemes())}"
-        if is_file:
-            said = f"the name must end in {', '.join(list_endings())}"
         raise InputError(f"'{uri.text}': {said}")
     source: Source = SOURCES[name](uri)
     return source

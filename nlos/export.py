@@ -131,16 +131,10 @@ def _write_npz(volume: Volume, path: Path) -> None:
 
 
 def _write_exr(volume: Volume, path: Path) -> None:
-    import OpenEXR
+    from tofclip.io.light_fields import write_exr_parts
 
-    projection = volume.maximum_projection()
-    # OpenEXR writes wrong pixels of arrays that are not contiguous.
-    channels = {
-        "Y": np.ascontiguousarray(projection.brightness, np.float32),
-        "Z": np.ascontiguousarray(projection.depth, np.float32),
-    }
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, channels).write(str(path))
+    front = volume.maximum_projection()
+    write_exr_parts({"": {"Y": front.brightness, "Z": front.depth}}, path)
 
 
 WRITERS: Mapping[str, Callable[[Volume, Path], None]] = {

@@ -151,7 +151,7 @@ def require_consistent(conditions: Iterable[tuple[object, str]]) -> None:
 
 def require_known(what: str, name: str, known: Collection[str]) -> None:
     """Refuse a name that is none of those known."""
-    require(name in known, f"unknown {what} '{name}'; take one of {', '.join(known)}")
+    require(name in known, f"unknown {what} '{name}'; choose one of {', '.join(known)}")
 
 
 def require_shape(what: str, expected: tuple[object, ...], got: tuple[int, ...]) -> None:

@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from tofclip.errors import FileFormatError, InputError, require
+from tofclip.errors import FileFormatError, InputError, require, require_known
 from tofclip.files import translate_read_errors
 
 if TYPE_CHECKING:
@@ -76,8 +76,7 @@ class Parts(Mapping[str, Any]):
             return load_target(self.own[name])
         if name in self.registered:
             return self.registered[name]
-        if name not in self.offered:
-            raise InputError(f"unknown {self.kind} '{name}'; choose one of {', '.join(self)}")
+        require_known(self.kind, name, self)
         try:
             return self.offered[name].load()
         except Exception as fault:  # whatever another package does when it is imported

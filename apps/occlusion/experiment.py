@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from tofclip.arrays import AnyArray
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_known
 from tofclip.light_field import LightField
 from tofclip.light_field.views import CameraSetup
 from tofclip.metrics import correlation_coefficient
@@ -82,10 +82,7 @@ class ExperimentSettings:
     samples: int = 2  # rays on a side of each pixel
 
     def __post_init__(self) -> None:
-        if self.illumination not in ILLUMINATIONS:
-            raise InputError(
-                f"unknown illumination '{self.illumination}'; take one of {', '.join(ILLUMINATIONS)}"
-            )
+        require_known("illumination", self.illumination, ILLUMINATIONS)
         if self.side_px < 24:
             raise InputError(f"a picture of {self.side_px} pixels shows nothing; take 24 or more")
         if not (np.isfinite(self.photons) and self.photons > 0):
@@ -267,8 +264,7 @@ def make_walking_scene(name: str) -> OcclusionScene:
 
 def make_occlusion_scene(name: str) -> OcclusionScene:
     """Return a scene of `SCENES`."""
-    if name not in SCENES:
-        raise InputError(f"unknown scene '{name}'; take one of {', '.join(SCENES)}")
+    require_known("scene", name, SCENES)
     target, occluder = SCENES[name]
     make_occluder, solid_width = OCCLUDERS[occluder]
     region = InactiveRegion(BASELINE_M, solid_width, OCCLUDER_DISTANCE_M)

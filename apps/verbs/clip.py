@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apps.cli import make_group
-from apps.options import JSON, arg, opt
+from apps.options import JSON, arg, name_any, opt
 from apps.progress import show_progress
 from apps.report import RECORD_SUFFIXES, build_provenance, report, require_writable, with_past
 from tofclip.errors import InputError
+from tofclip.plugins import DENOISERS
 
 if TYPE_CHECKING:
     from tofclip.arrays import AnyArray
@@ -24,6 +25,7 @@ ENCODERS = (
 )
 SURFACES = "surfaces"
 READABLE = "NPZ, HDF5, EXR with a part per view, or a folder."
+WRITABLE = (".h5", ".png", ".exr")
 
 app = make_group("clip")
 
@@ -33,7 +35,7 @@ def simulate(
     light_field: Path = arg("LIGHTFIELD", READABLE, read=True),
     encoder: str = opt(
         "NAME",
-        f"{', '.join(ENCODERS[:-1])} or {ENCODERS[-1]}.",
+        f"{name_any(ENCODERS)}.",
         ...,
         choices=ENCODERS,
     ),
@@ -67,12 +69,12 @@ def simulate(
 def recover(
     measurement: Path = arg("H5", "Measurements made by clip simulate.", read=True),
     shear: float = opt("S", "Depth to focus on, pixels per view step.", ...),
-    out: Path = opt("FILE", "The picture: .h5, .png or .exr.", ...),
+    out: Path = opt("FILE", f"The picture: {name_any(WRITABLE)}.", ...),
     prior: str = opt(
         "NAME",
-        "tv, wavelet or l1; or a denoiser: collaborative, bm3d or nlm.",
+        f"A method with a prior, such as tv, wavelet or l1, or a denoiser, such as {name_any(DENOISERS.own)}.",
         "tv",
-        choices=("tv", "wavelet", "l1", "collaborative", "bm3d", "nlm"),
+        choices=("tv", "wavelet", "l1", *DENOISERS.own),
     ),
     preset: str = opt(
         "NAME",
@@ -89,7 +91,8 @@ def recover(
     ),
     truth: Path | None = opt("LIGHTFIELD", "Light field to score against."),
     all_in_focus: Path | None = opt(
-        "FILE", "Picture sharp at all depths to write: .h5 (with its depths), .png or .exr."
+        "FILE",
+        f"Picture sharp at all depths to write: {name_any(WRITABLE)}; .h5 with its depths.",
     ),
     depth_map: Path | None = opt(
         "FILE",
@@ -118,7 +121,7 @@ def recover(
     outputs = [path for path in (out, all_in_focus) if path is not None]
     # A wrong ending is refused before the recovery, not after it; no output replaces an input.
     for path in outputs:
-        require_writable(path, ".h5", ".png", ".exr", inputs=(measurement, truth, depth_map))
+        require_writable(path, *WRITABLE, inputs=(measurement, truth, depth_map))
     if out == all_in_focus:
         raise InputError("--out and --all-in-focus name the same file; take two")
     if depth_map is not None and preset != SURFACES and all_in_focus is None:
@@ -205,9 +208,10 @@ def _write_picture(
     arrays: dict[str, AnyArray], out: Path, measurement: Path, settings: dict[str, Any]
 ) -> None:
     """Write the picture: a PNG scaled to its brightest pixel, else its values."""
-    import numpy as np
+    from matplotlib.image import imsave
 
     from tofclip.files import atomic_path
+    from tofclip.io.light_fields import write_exr_parts
     from tofclip.storage import Field, Record
 
     picture, suffix = arrays["picture"], out.suffix.lower()
@@ -217,16 +221,8 @@ def _write_picture(
         past = build_provenance(settings, measurement)
         Record("picture", fields, {"shear": settings["shear"]}, provenance=past).save(out)
         return
-    # Both libraries write to the name they get, which is not the final one yet.
-    with atomic_path(out) as temporary:
-        if suffix == ".exr":
-            import OpenEXR
-
-            header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-            # The library writes wrong pixels of arrays that are not contiguous.
-            channels = {"Y": np.ascontiguousarray(picture, np.float32)}
-            OpenEXR.File(header, channels).write(str(temporary))
-        else:
-            from matplotlib.image import imsave
-
-            imsave(temporary, picture, cmap="gray", vmin=0, format="png")
+    if suffix == ".exr":
+        write_exr_parts({"": {"Y": picture}}, out)
+        return
+    with atomic_path(out) as temporary:  # the library writes to the name that it gets
+        imsave(temporary, picture, cmap="gray", vmin=0, format="png")

@@ -14,8 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from apps.cli import make_group
 from apps.options import (
     CLUSTER,
@@ -26,12 +24,19 @@ from apps.options import (
     add_setting_flags,
     arg,
     load_settings,
+    name_any,
     opt,
     save_settings,
     setting,
     settings_to_dict,
 )
-from apps.progress import EXIT_SOME_FAILED, resolve_device, run_with_progress, show_activity
+from apps.progress import (
+    end_with,
+    list_failures,
+    resolve_device,
+    run_with_progress,
+    show_activity,
+)
 from apps.report import (
     RECORD_SUFFIXES,
     make_folder,
@@ -60,7 +65,7 @@ from apps.verbs.nlos_imaging import (
 )
 from apps.verbs.nlos_stream import film, stream
 from nlos.settings import METHODS, Settings
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_known
 from tofclip.files import PICTURE_SUFFIXES, identify_file, require_apart
 from tofclip.units import MILLIMETRE, PICOSECOND
 
@@ -71,11 +76,12 @@ if TYPE_CHECKING:
 
 PHOTONS = "photons"
 REFINEMENTS = ("l1", "tv", PHOTONS)
-NAMED_REFINEMENTS = f"{', '.join(REFINEMENTS[:-1])} or {PHOTONS}"
+NAMED_REFINEMENTS = name_any(REFINEMENTS)
 REFINED_METHOD = "hybrid"  # which is iterated by l1 and tv
 ITERATIONS = {"l1": 60, "tv": 60, PHOTONS: 12}
 PRIOR_WEIGHTS = {"l1": 2e-2, "tv": 2e-2, PHOTONS: 1.0}
 
+VOLUME_SUFFIXES = (*RECORD_SUFFIXES, ".vti", ".npz", ".exr", ".ply", ".pcd", ".csv")
 FOLDER_SETTINGS_NAME = ".settings.toml"
 CONTENT_MARK = "# the capture's content: "
 """In the settings beside a volume: what the capture was that it was made of."""
@@ -142,7 +148,7 @@ class ResultFiles:
     def require_writable(self, *inputs: Path | None) -> None:
         """Refuse names that cannot be written, or that would overwrite an input."""
         for volume in self.volumes:
-            require_writable(volume, *list_volume_suffixes(), inputs=inputs)
+            require_writable(volume, *VOLUME_SUFFIXES, inputs=inputs)
         if self.picture is not None:
             require_writable(self.picture, *PICTURE_SUFFIXES, inputs=inputs)
         if self.surface is not None:
@@ -161,13 +167,6 @@ class ResultFiles:
         return note_content(source) in text.splitlines()
 
 
-def list_volume_suffixes() -> tuple[str, ...]:
-    """List the endings of files that a volume can be written to."""
-    from nlos.export import POINT_SUFFIXES, WRITERS
-
-    return (*RECORD_SUFFIXES, *WRITERS, *POINT_SUFFIXES)
-
-
 def note_content(source: Path) -> str:
     """Return a comment by which a capture, or a folder of renderings, is known again by content."""
     if not source.is_dir():
@@ -183,9 +182,7 @@ def reconstruct(
     source: Path = arg(
         "CAPTURE", "Recovered frames of a relay wall, a capture, or a folder.", read=True
     ),
-    out: Path = opt(
-        "FILE", "The volume to write, .h5, .vti, .npz, .exr or .ply; or a folder.", ...
-    ),
+    out: Path = opt("FILE", f"The volume to write, {name_any(VOLUME_SUFFIXES)}; or a folder.", ...),
     png: Path | None = opt(
         "PNG", f"Picture of the volume, three views: {PICTURE_FORMATS}.", shown="only in a folder"
     ),
@@ -205,8 +202,9 @@ def reconstruct(
 
     rsd is quick and for planar, evenly scanned walls, hybrid nearly as quick and for any wall;
     backprojection takes every wall, laser and grid, and is slow. These three see through a virtual
-    pulse and give the same picture. filtered-backprojection, lct (light-cone transform) and fk (f-k
-    migration) do without; the last two want a confocal scan of a planar wall.
+    pulse, give the same picture, and compute on a GPU as well (--device). filtered-backprojection,
+    lct (light-cone transform) and fk (f-k migration) do without; the last two want a confocal scan of
+    a planar wall.
 
     The space in front of the wall is looked over with voxels of half a wavelength first, by the
     quickest of the first three; then the part that is bright is imaged with the voxels asked for.
@@ -220,9 +218,6 @@ def reconstruct(
     --surface takes what is foremost and bright on every line of sight from the wall (above
     --point-fraction of the brightest) and its direction: from a confocal scan of a planar wall by
     the directional light-cone transform, else from the gradients of the volume.
-
-    With --device rsd, hybrid and backprojection compute on a GPU; the
-    others cannot.
 
     Of a folder every capture is imaged into the folder --out. Captures whose results are there
     already are skipped. If some fail, the others are done all the same, and the exit status is 1.
@@ -397,11 +392,8 @@ def _reconstruct_folder(
     """Image every capture of a folder whose results are not there yet."""
     from tofclip.sequences.jobs import Job, run_jobs
 
-    known = list_volume_suffixes()
-    if unknown := [suffix for suffix in suffixes if suffix not in known]:
-        raise InputError(
-            f"no format of volumes is called '{unknown[0]}'; use one of {', '.join(known)}"
-        )
+    for suffix in suffixes:
+        require_known("format of volumes", suffix, VOLUME_SUFFIXES)
     sources, results = list_captures(inputs[0]), {}
     for path in sources:
         volumes = [out.resolve() / f"{path.stem}{suffix}" for suffix in suffixes]
@@ -433,15 +425,12 @@ def _reconstruct_folder(
     )
     # Workers of a cluster finish in any order.
     imaged.sort(key=lambda one: str(one["capture"]))
-    failed = {failure.name: failure.problem for failure in summary.failures}
-    for name, reason in failed.items():
-        say("failed", f"{name}: {reason}")
+    failed = list_failures(summary)
     lists = {"imaged": imaged, "skipped": skipped, "failed": failed}
     counts = {"imaged": summary.done, "skipped": len(skipped), "failed": len(failed)}
     figures = {"captures": len(sources), **(lists if as_json else counts)}
     report(figures, as_json, [out])
-    if failed:
-        raise typer.Exit(EXIT_SOME_FAILED)
+    end_with(failed)
 
 
 def _run_job(

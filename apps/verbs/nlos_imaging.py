@@ -41,7 +41,7 @@ from apps.report import (
 )
 from nlos.known_scenes import SceneSettings
 from nlos.settings import METHODS, METHODS_BY_SPEED, Settings, list_taken
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_known
 from tofclip.files import PICTURE_SUFFIXES, require_apart
 
 if TYPE_CHECKING:
@@ -105,8 +105,7 @@ def parse_method_names(text: str) -> tuple[str, ...]:
     """Split a list of methods at its commas, refusing unknown names and repetitions."""
     names = tuple(name.strip() for name in text.split(","))
     for name in names:
-        if name not in METHODS:
-            raise InputError(f"unknown method '{name}'; choose from {', '.join(METHODS)}")
+        require_known("method", name, METHODS)
     if len(set(names)) < len(names):
         raise InputError(f"a method is named twice in '{text}'")
     return names

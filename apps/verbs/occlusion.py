@@ -10,7 +10,7 @@ from apps.cli import make_group
 from apps.options import JSON, NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, flag, opt
 from apps.progress import show_activity, show_progress
 from apps.report import make_folder, report, require_new, require_writable
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_known
 from tofclip.files import PICTURE_SUFFIXES
 
 SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board")
@@ -133,8 +133,7 @@ def demo(
         raise InputError("--live writes nothing; leave --out out")
     if (recording is not None or camera is not None) and not live:
         raise InputError("--recording and --camera are for --live")
-    if encoder not in DEFAULT_PHOTONS:
-        raise InputError(f"unknown encoder '{encoder}'; take one of {', '.join(DEFAULT_PHOTONS)}")
+    require_known("encoder", encoder, DEFAULT_PHOTONS)
     # A single pixel sums a whole picture and so needs more photons.
     usual = DEFAULT_PHOTONS[encoder] if photons is None else photons
     side = side_px or (LIVE_SIDE_PX if live else SIDE_PX)

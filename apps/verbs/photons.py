@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apps.options import JSON, arg, flag, opt
+from apps.options import JSON, PICTURE_FORMATS, arg, flag, name_any, opt
 from apps.progress import show_share
 from apps.report import build_provenance, report, require_writable, say
 from apps.verbs.recover import CLOUD_SUFFIXES, DEPTH_SUFFIX
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from tofclip.lidar.photons import PhotonImage, SurfaceImage
 
 RANGE_IMAGE_SUFFIX = ".npz"
+POINT_SUFFIXES = tuple(one for one in CLOUD_SUFFIXES if one != RANGE_IMAGE_SUFFIX)
 DEFAULT_FIELD_OF_VIEW_DEG = 30.0
 MAX_RETURNS = 255  # of a pixel: clouds number them in a byte
 # Of the cycles that a photon ended: at 3 photons a cycle (.95) a learnt pulse is .4 mm late, at 5 (.993) 4 mm
@@ -55,8 +56,8 @@ def photons(
     ),
     out: Path = opt(
         "FILE",
-        "Ends in .npz for a range image, in .ply, .pcd, .csv, .las, .laz or .h5 for a point cloud, in .exr for a depth "
-        "picture, in .png, .pdf or .svg for a drawing.",
+        f"Ends in {RANGE_IMAGE_SUFFIX} for a range image, in {name_any(POINT_SUFFIXES)} for a point cloud, in "
+        f"{DEPTH_SUFFIX} for a depth picture, in {PICTURE_FORMATS} for a drawing.",
         ...,
     ),
     bin_width: float | None = opt(

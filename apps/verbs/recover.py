@@ -28,6 +28,7 @@ from apps.options import (
     TOPIC,
     arg,
     flag,
+    name_any,
     opt,
 )
 from apps.progress import (
@@ -49,7 +50,7 @@ from apps.report import (
     say,
     with_past,
 )
-from tofclip.errors import InputError, TofclipError
+from tofclip.errors import InputError, TofclipError, require_known
 from tofclip.files import require_apart
 from tofclip.plugins import DENOISERS, METHODS, split_assignments
 
@@ -243,7 +244,7 @@ def cloud(
     ),
     out: Path = opt(
         "FILE",
-        "Ends in .ply, .pcd, .csv, .npz, .las, .laz, .e57, .h5, or .exr for a depth picture; of a sequence: a folder.",
+        f"Ends in {name_any(CLOUD_SUFFIXES)}, or {DEPTH_SUFFIX} for a depth picture; of a sequence: a folder.",
         ...,
     ),
     drop_outliers: bool = flag(
@@ -328,9 +329,7 @@ def cloud(
 
 def require_format(suffix: str, *further: str) -> None:
     """Refuse an ending that names no format of clouds."""
-    known = (*CLOUD_SUFFIXES, *further)
-    if suffix not in known:
-        raise InputError(f"no cloud format is called '{suffix}'; use one of {', '.join(known)}")
+    require_known("format of clouds", suffix, (*CLOUD_SUFFIXES, *further))
 
 
 MAX_LATENCY_SAMPLES = 10_000  # over which medians are taken: a stream may run for days

@@ -162,10 +162,11 @@ class TestLetters:
     FEW_ROWS = slice(50, 230)
 
     @pytest.fixture(scope="class")
-    def letters(self, clip, frames):
+    @classmethod
+    def letters(cls, clip, frames):
         """Of a few rows, by a method that sharpens strokes."""
         streak = read_streak(clip / "scene5.tif")
-        counts, times = streak.counts[self.FEW_ROWS], streak.times[self.FEW_ROWS]
+        counts, times = streak.counts[cls.FEW_ROWS], streak.times[cls.FEW_ROWS]
         few = replace(streak, counts=counts, row_times=times, saturated=None)
         return recover(few, frames.camera, Sparse(iterations=25))
 

@@ -58,11 +58,13 @@ class TestRegion:
 
 class TestDemonstration:
     @pytest.fixture(scope="class")
-    def folder(self, tmp_path_factory):
+    @classmethod
+    def folder(cls, tmp_path_factory):
         return tmp_path_factory.mktemp("occlusion") / "made"
 
     @pytest.fixture(scope="class")
-    def reported(self, request, folder):
+    @classmethod
+    def reported(cls, request, folder):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(occlusion_figures, "WALK_STEPS", 3)
             words = "--scene plate --side-px 40 --sampling-ratio 1 --moving --out {folder}"

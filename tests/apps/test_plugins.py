@@ -36,7 +36,7 @@ KEPT = {
     "nlos.readers": "npz matlab hdf5",
     "tofclip.sources": "aravis linospad2 remoteex spad512 timetag tmf8828 vl53l8 sim+aravis"
     " sim+linospad2 sim+remoteex sim+spad512 sim+timetag sim+tmf8828 sim+vl53l8"
-    " .dat .img .tif .tiff .phu .ptu .sdt .ttbin .h5 .hdf5",
+    " .dat .tif .phu .ptu .sdt .ttbin .h5 .hdf5",
 }
 EVERY = (
     METHODS,
@@ -176,6 +176,8 @@ def test_parts_of_a_package_are_used(package, tmp_path, shell):
     assert (made.denoiser.share, made.strength, made.start.iterations) == (0.25, 0.2, 7)
     (tmp_path / "shot.txt").write_text("MINE 3")
     assert tofclip.read_streak(tmp_path / "shot.txt").counts[0, 0] == 3
+    with devices.open(f"file://{tmp_path}/shot.txt") as source:
+        assert next(iter(source)).records["counts"][0, 0, 0] == 3
     assert outline(tmp_path / "shot.txt").fields["counts"].values.shape == (4, 5)
     assert "values" not in shell.figures(f"info {tmp_path}/shot.txt")["fields"]["counts"]
     (tmp_path / "other.txt").write_text("OTHER")

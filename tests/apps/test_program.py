@@ -281,24 +281,27 @@ for line in sys.argv[1:]:
 """
 
     @pytest.fixture(scope="class")
-    def hook(self, tmp_path_factory):
+    @classmethod
+    def hook(cls, tmp_path_factory):
         """Folder whose presence on the path hides packages, also from what the program starts."""
         folder = tmp_path_factory.mktemp("absent")
-        (folder / "sitecustomize.py").write_text(self.ABSENT)
+        (folder / "sitecustomize.py").write_text(cls.ABSENT)
         return folder
 
     @pytest.fixture(scope="class")
-    def frames(self, files, tmp_path_factory):
+    @classmethod
+    def frames(cls, files, tmp_path_factory):
         out = tmp_path_factory.mktemp("frames") / "frames.h5"
         tofclip.recover(tofclip.read_streak(files / "streak.h5"), method="linear").save(out)
         return out
 
     @pytest.fixture(scope="class")
-    def outcomes(self, hook, files, frames, tmp_path_factory):
+    @classmethod
+    def outcomes(cls, hook, files, frames, tmp_path_factory):
         """Status, output and messages by line, of one process without all that some verbs need."""
         new = tmp_path_factory.mktemp("new")
         lines = [NEEDED[name][1].format(files=files, frames=frames, new=new) for name in AT_TIMES]
-        words = [sys.executable, "-c", self.RUN, *lines, "doctor --json"]
+        words = [sys.executable, "-c", cls.RUN, *lines, "doctor --json"]
         done = start(words, path=hook, ABSENT=" ".join(AT_TIMES))
         assert done.returncode == 0, done.stderr
         found = map(json.loads, done.stdout.splitlines())

@@ -112,7 +112,7 @@ def take_stock(*folders):
     return {path: (stat.st_size, stat.st_mtime_ns) for path, stat in stats.items()}
 
 
-@pytest.mark.parametrize(("typed", "said"), read_table())
+@pytest.mark.parametrize(("typed", "said"), [*read_table()])
 def test_a_mistake_is_answered_in_a_line(shell, files, spoilt, curved, typed, said):
     before = take_stock(files, spoilt, curved.parent)
     shell.refuses(typed, said, long=300 * "x")

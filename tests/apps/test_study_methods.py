@@ -87,7 +87,8 @@ class TestDiffuser:
     """The recorded hand, from a dense and from sparse sensors."""
 
     @pytest.fixture(scope="class")
-    def hand(self, shared_data):
+    @classmethod
+    def hand(cls, shared_data):
         return read_diffuser_recording(shared_data / "diffusercam" / "psf_hand_300x400.npz")
 
     @pytest.mark.nightly

@@ -120,7 +120,7 @@ def test_the_likelihood_of_photons_does_about_as_well_as_squares(scene, truth):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"prior": "magic"}, "unknown prior 'magic'; take one of tv, wavelet, l1, collaborative"),
+        ({"prior": "magic"}, "unknown prior 'magic'; choose one of tv, l1, wavelet, collaborative"),
         ({"preset": "slow"}, "unknown preset"),
         ({"data_term": "cubes"}, "unknown data term"),
         ({"weight": -1.0}, "positive"),

@@ -54,7 +54,7 @@ def test_shots_to_frames_to_clouds_on_a_cluster(run, scheduler, few, tmp_path):
     status, out, err = run(line)
     assert status == 1
     assert "results                      2" in out
-    assert err.splitlines()[-1].startswith("failed: shot1: ")
+    assert err.splitlines()[-1].startswith("tofclip: failed: shot1: ")
     assert "give one (--camera camera.h5, made by" in err
     assert sorted(path.name for path in frames.glob("*.h5")) == ["shot0.h5", "shot2.h5"]
     shutil.copy(few / "shot0.h5", few / "shot1.h5")

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,6 +67,25 @@ def read_exr_parts(path: Path) -> list[tuple[str, Channels]]:
     return parts
 
 
+def write_exr_parts(parts: Mapping[str, Channels], path: str | Path) -> None:
+    """Write the channels of parts by their names as 32-bit floats, whole or not at all."""
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    # The library writes wrong pixels of arrays that are not contiguous, and a part's name into its
+    # header.
+    made = [
+        OpenEXR.Part(
+            dict(header),
+            {one: np.ascontiguousarray(pixels, np.float32) for one, pixels in channels.items()},
+            name,
+        )
+        for name, channels in parts.items()
+    ]
+    with atomic_path(path) as temporary:
+        OpenEXR.File(made).write(str(temporary))
+
+
 def read_exr(path: Path) -> LightField:
     """Read the parts named like ``v=-1,u=0``, with a channel Y or with R, G and B."""
     pictures, views = [], []
@@ -92,20 +111,9 @@ def read_exr(path: Path) -> LightField:
 
 
 def write_exr(light_field: LightField, path: Path) -> None:
-    """Write one part for each view with a channel Y of float32."""
-    import OpenEXR
-
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    parts = [
-        # The library writes wrong pixels of arrays that are not contiguous, and the part's name
-        # into the header.
-        OpenEXR.Part(
-            dict(header), {"Y": np.ascontiguousarray(picture, np.float32)}, f"v={v:g},u={u:g}"
-        )
-        for picture, (v, u) in zip(light_field.pictures, light_field.views.tolist(), strict=True)
-    ]
-    with atomic_path(path) as temporary:
-        OpenEXR.File(parts).write(str(temporary))
+    """Write one part for each view with a channel Y."""
+    seen = zip(light_field.pictures, light_field.views.tolist(), strict=True)
+    write_exr_parts({f"v={v:g},u={u:g}": {"Y": picture} for picture, (v, u) in seen}, path)
 
 
 def read_folder(folder: Path) -> LightField:

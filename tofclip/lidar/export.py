@@ -505,7 +505,7 @@ def save_depth(returns: Returns, path: str | Path) -> None:
 
     Channel ``Z`` is the depth along the optical axis in metres, infinite where nothing came back,
     as renderers have it; ``Y`` the intensity in counts referred to 1 m, 0 there. Both are 32-bit
-    floats, uncompressed.
+    floats.
 
     Parameters
     ----------
@@ -513,15 +513,11 @@ def save_depth(returns: Returns, path: str | Path) -> None:
     path : path-like
         Ends in ``.exr``.
     """
-    import OpenEXR
+    from tofclip.io.light_fields import write_exr_parts
 
     distance, intensity = returns.image("range"), returns.image("intensity")
     seen = np.isfinite(distance)
     depth = np.full(distance.shape, np.inf, dtype=np.float32)
     directions = compute_ray_directions(returns.camera, *np.nonzero(seen))
     depth[seen] = distance[seen] * directions[:, 2]
-    brightness = np.where(seen, intensity, 0).astype(np.float32)
-    header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
-    channels = {"Z": np.ascontiguousarray(depth), "Y": np.ascontiguousarray(brightness)}
-    with atomic_path(path) as temporary:
-        OpenEXR.File(header, channels).write(str(temporary))
+    write_exr_parts({"": {"Z": depth, "Y": np.where(seen, intensity, 0)}}, path)

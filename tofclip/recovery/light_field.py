@@ -50,7 +50,6 @@ from tofclip.solvers.fista import (
     choose_weight,
 )
 
-VARIATIONAL_PRIORS = ("tv", "wavelet", "l1")  # methods of `tofclip.plugins`
 PRESETS = {"fast": 2, "quality": 10}  # calls of the denoiser
 DATA_TERMS = ("squares", "huber", "poisson")
 MAX_ITERATIONS = 400
@@ -111,7 +110,8 @@ class ClipRecovery:
 
     def __post_init__(self) -> None:
         if not (_is_variational(self.prior) or self.prior in DENOISERS):
-            require_known("prior", self.prior, [*VARIATIONAL_PRIORS, *DENOISERS])
+            variational = filter(_is_variational, METHODS.own)
+            require_known("prior", self.prior, [*variational, *DENOISERS])
         require_known("preset", self.preset, PRESETS)
         require_known("data term", self.data_term, DATA_TERMS)
         if self.weight is not None:
@@ -268,10 +268,8 @@ def _make_robust(method: ProximalMethod, problem: _InverseProblem) -> ProximalMe
 
 def _is_variational(prior: str) -> bool:
     """Whether a prior is minimised with the data term, and no denoiser."""
-    if prior in VARIATIONAL_PRIORS:
-        return True
-    own = prior not in DENOISERS and prior in METHODS
-    return own and ProximalMethod in getattr(METHODS[prior], "__mro__", ())
+    is_method = prior not in DENOISERS and prior in METHODS
+    return is_method and ProximalMethod in getattr(METHODS[prior], "__mro__", ())
 
 
 # The weight is relative to the largest A'f, and far below that of refocusing, as nothing is out of

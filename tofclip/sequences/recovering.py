@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tofclip.arrays import CPU, parse_device
-from tofclip.errors import InputError, require
+from tofclip.errors import InputError, require, require_known
 from tofclip.files import compute_sha256
 from tofclip.lidar import PointCloud, Returns, depth, point_cloud
 from tofclip.lidar.cloud import save_organised
@@ -197,10 +197,7 @@ class CloudSettings:
     false_alarm: float | None = None
 
     def __post_init__(self) -> None:
-        require(
-            self.returns in RETURN_CHOICES,
-            f"no return is called '{self.returns}'; choose one of {', '.join(RETURN_CHOICES)}",
-        )
+        require_known("return", self.returns, RETURN_CHOICES)
         require(
             not self.organised or self.returns != "all",
             "an organised cloud has one point for a pixel: choose the first, strongest or last "
