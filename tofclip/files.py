@@ -233,7 +233,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         temporary = _create_temporary_file(target)
     except OSError as fault:
-        raise StorageError(f"{target}: cannot be written: {_explain_os_error(fault)}") from fault
+        raise StorageError(f"{target}: cannot be written: {explain_os_error(fault)}") from fault
     try:
         yield temporary
         _flush_to_disk(temporary)
@@ -246,7 +246,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         # Writers of other libraries have errors of their own, or OSErrors without a number, for a
         # disk that is full; as long as the temporary file is there, it still is.
         if isinstance(fault, OSError) and fault.errno is not None:
-            reason = _explain_os_error(fault)
+            reason = explain_os_error(fault)
         elif _is_full(target.parent):
             reason = DISK_IS_FULL
         elif isinstance(fault, OSError):
@@ -405,7 +405,8 @@ def _is_full(folder: Path) -> bool:
     return False
 
 
-def _explain_os_error(fault: OSError) -> str:
+def explain_os_error(fault: OSError) -> str:
+    """Return why the system refuses to write, and what to do about it."""
     if fault.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return DISK_IS_FULL
     reasons: dict[type[OSError], str] = {
@@ -414,7 +415,7 @@ def _explain_os_error(fault: OSError) -> str:
         IsADirectoryError: "it is a folder; name a file",
         PermissionError: "writing is not permitted there",
     }
-    return reasons.get(type(fault)) or format_error_line(fault)
+    return reasons.get(type(fault)) or fault.strerror or format_error_line(fault)
 
 
 def format_error_line(fault: BaseException) -> str:

@@ -187,11 +187,12 @@ def recover(
     started = time.perf_counter()
     with show_activity(f"reading {streak}"):
         # Outputs and settings have been checked by now: an instrument is not started for nothing.
-        if "://" in streak:
-            from devices.transients import read_transient
-            from tofclip.shots import Streak
+        from devices.transients import find_address, read_transient
+        from tofclip.shots import Streak
 
-            taken = read_transient(streak, bin_width)
+        address = streak if "://" in streak else find_address(streak)
+        if address is not None:
+            taken = read_transient(address, bin_width)
             if not isinstance(taken, Streak):
                 raise InputError(
                     f"{streak}: its pixels look at the scene themselves, so that nothing is to be recovered; "

@@ -17,6 +17,7 @@ from typing import Any
 from devices.recording.read import HEADER_BYTES, Block, BlockKind, Ending
 from devices.source import Codec, Gap, Info, Piece, Stats
 from tofclip.errors import InputError, StorageError
+from tofclip.files import explain_os_error
 from tofclip.storage import Record
 
 try:
@@ -145,7 +146,7 @@ class RecordingWriter:
 
     def _explain(self, fault: OSError) -> StorageError:
         safe = "; what was recorded so far is safe" if self.bytes_written else ""
-        return StorageError(f"{self._path}: cannot be written: {fault.strerror}{safe}")
+        return StorageError(f"{self._path}: cannot be written: {explain_os_error(fault)}{safe}")
 
 
 def _render_head(head: Record) -> bytes:
@@ -167,10 +168,7 @@ def _explain_refusal(path: Path) -> Iterator[None]:
     except StorageError:
         raise
     except OSError as fault:
-        said = fault.strerror
-        if isinstance(fault, FileNotFoundError):
-            said = "the folder does not exist; create it first"
-        raise StorageError(f"{path}: cannot be written: {said}") from fault
+        raise StorageError(f"{path}: cannot be written: {explain_os_error(fault)}") from fault
 
 
 def _create_file(path: Path, overwrite: bool, stack: contextlib.ExitStack) -> tuple[int, Path]:

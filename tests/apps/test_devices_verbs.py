@@ -93,3 +93,11 @@ def test_a_recording_is_not_overwritten_unless_asked(shell, recording):
     assert path.read_bytes() == before
     assert shell(f"{line} --overwrite").status == 0
     assert path.read_bytes() != before
+
+
+def test_what_was_recorded_is_recovered(shell, tmp_path):
+    """By the name of the file, as every other verb takes it."""
+    made = tmp_path / "shots.h5"
+    record_source(devices.open("sim+remoteex://?seed=1&scene=small&frames=2"), made, 2.0)
+    found = shell.figures(f"recover {made} --method linear --out frames.h5")
+    assert found["image_shape"] == [32, 32]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from tofclip.errors import InputError, StorageError
-from tofclip.files import guard, import_file_reader
+from tofclip.files import explain_os_error, guard, import_file_reader
 from tofclip.lidar.cloud import PointCloud, complete_cloud
 from tofclip.lidar.export import make_rows
 
@@ -79,7 +79,7 @@ def write_bag(
             else:
                 shutil.move(bag, target)
     except OSError as fault:
-        raise StorageError(f"{target}: cannot be written: {fault.strerror or fault}") from fault
+        raise StorageError(f"{target}: cannot be written: {explain_os_error(fault)}") from fault
     return number
 
 

@@ -32,6 +32,7 @@ from tofclip.errors import (
 )
 from tofclip.files import (
     atomic_path,
+    explain_os_error,
     format_error_line,
     identify_file,
     remove_temporary_files,
@@ -70,7 +71,7 @@ def lock_output_folder(
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
-        raise StorageError(f"{folder}: cannot be made: {fault.strerror or fault}") from fault
+        raise StorageError(f"{folder}: cannot be made: {explain_os_error(fault)}") from fault
     wanted = {name: str(one) if isinstance(one, Path) else one for name, one in settings.items()}
     inputs = inputs or {}
     # the shots of a stack share a file, which is read once
