@@ -23,6 +23,7 @@ import typer
 
 from tofclip.errors import InputError, StorageError
 from tofclip.files import PICTURE_SUFFIXES, atomic_path, read_toml, suggest_name
+from tofclip.plugins import READERS
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
@@ -108,6 +109,7 @@ TIME_ZERO = opt(
     name="--time-zero-ns",
     shown="the camera's",
 )
+STREAK_IMAGE = f"A streak image ({', '.join(READERS.own)}, or another of tofclip plugins)"
 CAMERA = opt("H5", "Made by calibrate.", shown="the one inside the shot")
 FOCUS = opt("SHEAR", "depth-locked or fixed:S.", "fixed:0")
 PICTURE_FORMATS = name_any(PICTURE_SUFFIXES)

@@ -183,10 +183,10 @@ class Reader(NamedTuple):
 
 
 def read_by_signature(
-    readers: Parts, path: str | Path, use: Callable[[Reader], Found], known: str
+    readers: Parts, path: str | Path, use: Callable[[Reader], Found], what: str
 ) -> Found:
     """Return what `use` makes of the first reader that takes a file. Where those that know its first
-    bytes refuse it, the first one's error is raised; `known` says what files could have been.
+    bytes refuse it, the first one's error is raised; `what` the readers make of files, in words.
     """
     with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(SIGNATURE_BYTES)
@@ -204,7 +204,8 @@ def read_by_signature(
                 return use(reader)
             except FileFormatError as fault:
                 refusals.append(fault)
-    raise refusals[0] if refusals else FileFormatError(path, f"is not {known}{broken}")
+    known = f"is not a {what} of a known format ({', '.join(readers)}){broken}"
+    raise refusals[0] if refusals else FileFormatError(path, known)
 
 
 def load_target(target: str) -> Any:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apps.options import JSON, arg, opt
+from apps.options import JSON, STREAK_IMAGE, arg, opt
 from apps.report import (
     MAX_LISTED_VALUES,
     RECORD_SUFFIXES,
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def convert(
-    streak: Path = arg("STREAK", "HPD-TA TIFF or LIFT archive.", read=True),
+    streak: Path = arg("STREAK", f"{STREAK_IMAGE}.", read=True),
     out: Path = opt("H5", "The file to write.", ...),
     bin_width: float | None = opt(
         "PS", "Duration of a row in ps, where the file does not say it.", name="--bin-width-ps"

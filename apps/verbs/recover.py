@@ -23,6 +23,7 @@ from apps.options import (
     FRAME_ID,
     JSON,
     PREVIEW,
+    STREAK_IMAGE,
     SUFFIX,
     TIME_ZERO,
     TOPIC,
@@ -70,7 +71,7 @@ ALL_POINTS = flag(
 def recover(
     streak: str = arg(
         "STREAK",
-        "HPD-TA TIFF, ITEX, LIFT archive, our HDF5, or a source such as sim+linospad2://?seed=1. "
+        f"{STREAK_IMAGE}, or a source such as sim+linospad2://?seed=1. "
         "A sequence: a folder, a quoted pattern, or an HDF5 stack.",
         read=True,
     ),

@@ -110,11 +110,10 @@ def read_capture(path: str | Path) -> Capture:
     InputError
         What it holds is not a usable capture.
     """
-    kinds = "a capture of a known format (HDF5, .npz, .mat, or a folder of EXR files)"
     capture: Capture = (
         read_streak_folder(path)
         if Path(path).is_dir()
-        else read_by_signature(READERS, path, lambda one: one.read(Path(path)), kinds)
+        else read_by_signature(READERS, path, lambda one: one.read(Path(path)), "capture")
     )
     if capture.provenance:
         return capture

@@ -329,7 +329,7 @@ def test_every_output_is_opened(shell, written, name, kind):
         assert Path("view.png").stat().st_size > 1000
     elif name in NOT_SHOWN:
         said = shell.refuses(line)
-        assert any(word in said for word in ("camera", kind, "is not a TIFF"))
+        assert any(word in said for word in ("camera", kind, "is not a streak image"))
 
 
 def test_clouds_of_every_format_are_layers_of_one_scene(shell, written):

@@ -182,7 +182,7 @@ def test_parts_of_a_package_are_used(package, tmp_path, shell):
     assert "values" not in shell.figures(f"info {tmp_path}/shot.txt")["fields"]["counts"]
     (tmp_path / "other.txt").write_text("OTHER")
     with pytest.raises(
-        FileFormatError, match=r"is not a TIFF.*; reader 'broken' of mine 1\.0 does"
+        FileFormatError, match=r"is not a streak image.*texts.*; reader 'broken' of mine 1\.0 does"
     ):
         tofclip.read_streak(tmp_path / "other.txt")
 

@@ -51,9 +51,6 @@ TIFF = _make_reader(open_tiff, b"II*\0", b"MM\0*")
 LIFT = _make_reader(open_lift, b"PK\x03\x04")
 OWN = _make_reader(_open_own, HDF5_SIGNATURE)
 ITEX = _make_reader(open_itex, ITEX_SIGNATURE)
-KNOWN_FILES = (
-    "a TIFF, ITEX (.img), LIFT archive (.npz) or HDF5 streak image, or what a plug-in reads"
-)
 
 
 def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
@@ -88,7 +85,7 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
     """
     require_path(path)
     streak: Streak = read_by_signature(
-        READERS, path, lambda reader: reader.read(Path(path)), KNOWN_FILES
+        READERS, path, lambda reader: reader.read(Path(path)), "streak image"
     )
     if bin_width is not None:
         streak = streak.with_bin_width(bin_width)
@@ -102,7 +99,7 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
 def outline_streak_file(path: str | Path) -> Record:
     """Describe the streak image in a file without reading its pixels, as `read_outline` does."""
     outline = read_by_signature(
-        READERS, path, lambda reader: _outline(reader, Path(path)), KNOWN_FILES
+        READERS, path, lambda reader: _outline(reader, Path(path)), "streak image"
     )
     if outline.provenance:
         return outline
