@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from textwrap import shorten
 from typing import Any
 
 import typer
@@ -323,7 +322,7 @@ def plugins(
         return
     width = max(len(one["name"]) for one in shown)
     for one in shown:
-        text = one["fault"] or (one["meaning"] if name else shorten(one["meaning"], TEXT_WIDTH))
+        text = one["fault"] or (one["meaning"] if name else one["meaning"][:TEXT_WIDTH])
         print(f"{one['group']:<18}{one['name']:<{width}}  {one['origin']:<12}  {text}")
         for setting in one["settings"] if name else ():
             lead = "?" if one["group"] == "tofclip.sources" else "--set "

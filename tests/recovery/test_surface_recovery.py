@@ -45,6 +45,7 @@ def test_surfaces_are_better_than_frames_in_picture_and_range(shot, found):
 def test_frames_are_the_rendering_of_the_returns_and_keep_them(found, tmp_path: Path):
     assert found.figures["method"] == "surfaces"
     assert found.figures["surfaces"] == 3
+    assert "duality_gap" not in found.figures  # which was of the frames that it began with
     # all steps on ranges are taken only where they go on moving
     assert 105 <= found.figures["iterations"] <= SurfaceRecovery().steps == 150
     assert found.figures["relative_residual"] < 0.1

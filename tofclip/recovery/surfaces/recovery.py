@@ -110,6 +110,7 @@ class SurfaceRecovery:
             measure(image, model.weights == 0, model.camera, 0.0)
             for image in (model.render(amplitude), model.image)
         )
+        started = {name: one for name, one in frames.figures.items() if name != "duality_gap"}
         error = np.linalg.norm((predicted.values - measured.values)[measured.valid])
         distance = SPEED_OF_LIGHT * np.maximum(frames.times / 2, frames.bin_width)
         return replace(
@@ -117,7 +118,7 @@ class SurfaceRecovery:
             values=_render_frames(frames, model, model.shade(model.reference, amplitude)),
             camera=camera,
             figures={
-                **frames.figures,
+                **started,
                 "method": self.name,
                 "focus": "depth-locked",
                 "iterations": START_ITERATIONS
