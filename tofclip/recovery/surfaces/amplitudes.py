@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import Image
-from tofclip.threads import run_blocks
 
 PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
 NORM_ITERATIONS, FURTHER_NORM_ITERATIONS = 10, 2
@@ -131,7 +130,7 @@ class AmplitudeSolver:
         for number in range(iterations):
             if against_dim and number % REWEIGHT_ITERATIONS == 0:
                 cost = self._cost_dim(against_dim, np.sqrt(information))
-            slope = model.gather(model.weights * (model.render(ahead) - model.image)) + cost
+            slope = model.pull(ahead, model.image) + cost
             moved = self._shrink(ahead - step * slope, weights * steps)
             if np.sum((ahead - moved) * (moved - self.amplitude)) > 0:
                 age = 1.0  # the momentum points uphill (O'Donoghue and Candes, 2015)
@@ -159,7 +158,7 @@ class AmplitudeSolver:
         vector, norms = self._direction, np.ones(count)
         # the vector of the last time is nearly the one of moved surfaces
         for _ in range(NORM_ITERATIONS if self._fresh else FURTHER_NORM_ITERATIONS):
-            vector = model.gather(model.weights * model.render(vector))
+            vector = model.pull(vector)
             norms = np.sqrt(np.bincount(model.surface, vector.astype(np.float64) ** 2, count))
             norms = np.maximum(norms, 1e-3 * norms.max())
             vector /= norms[model.surface].astype(np.float32)
@@ -172,19 +171,18 @@ class AmplitudeSolver:
 
         masks, found = self.model.masks, np.empty_like(amplitude)
 
-        def work(block: slice) -> None:
-            for one in range(block.start, block.stop):
-                rows, columns = self._boxes[one]
-                mask = np.ascontiguousarray(masks[one, rows, columns])
-                picture = np.zeros(mask.shape, np.float32)
-                picture[mask] = amplitude[self.model.parts[one]]
-                dual = np.ascontiguousarray(self._dual[one, :, rows, columns])
-                result = np.empty_like(picture)
-                prox_masked_tv(picture, mask, weights[one], PROX_ITERATIONS, dual, result)
-                self._dual[one, :, rows, columns] = dual
-                found[self.model.parts[one]] = result[mask]
+        def work(one: int) -> None:
+            rows, columns = self._boxes[one]
+            mask = np.ascontiguousarray(masks[one, rows, columns])
+            picture = np.zeros(mask.shape, np.float32)
+            picture[mask] = amplitude[self.model.parts[one]]
+            dual = np.ascontiguousarray(self._dual[one, :, rows, columns])
+            result = np.empty_like(picture)
+            prox_masked_tv(picture, mask, weights[one], PROX_ITERATIONS, dual, result)
+            self._dual[one, :, rows, columns] = dual
+            found[self.model.parts[one]] = result[mask]
 
-        run_blocks(work, len(masks), 1)
+        self.model.map_parallel(work, len(masks))
         return found
 
 
@@ -236,7 +234,7 @@ def explain_by_amplitude(model: SurfaceModel, image: Image, scale: Image, iterat
     for _ in range(iterations):
         if energy == 0:
             break
-        product = scale * model.gather(model.weights * model.render(scale * direction))
+        product = scale * model.pull(scale * direction)
         length = energy / float(np.sum(direction * product, dtype=np.float64))
         change += np.float32(length) * scale * direction
         residual -= np.float32(length) * product

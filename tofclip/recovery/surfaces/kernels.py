@@ -61,17 +61,17 @@ def split_over_slit(position, width, height, tangent, first, shares):
 
 
 @fast_loop
-def add_light(amplitude, point, share, row, row_shares, column, slit_shares, image):
+def add_light(amplitude, point, share, row, row_shares, column, slit_shares, above, before, image):
     """Add the light of surface points to the image of a view; all of it must fall inside. `point, share`
     (places,): of which point each place has which part; `row, column`: first of those that a place
-    reaches, shares there (places, 3) and (places, 4).
+    reaches, shares there (places, 3) and (places, 4); `above, before`: the image's first ones.
     """
     for place in range(point.size):
         # most points of a volume are dark
         light = amplitude[point[place] - point[0]] * share[place]
         if light == 0:
             continue
-        top, left = row[place], column[place]
+        top, left = row[place] - above, column[place] - before
         for i in range(3):
             instant = light * row_shares[place, i]
             for j in range(4):
@@ -79,10 +79,10 @@ def add_light(amplitude, point, share, row, row_shares, column, slit_shares, ima
 
 
 @fast_loop
-def gather_light(image, gain, point, share, row, row_shares, column, slit_shares, amplitude):
-    """The adjoint of `add_light`: what each point's light would find in an image."""
+def gather_light(image, gain, point, share, row, row_shares, column, slit_shares, above, amplitude):
+    """The adjoint of `add_light`: what each point's light would find in an image of all columns."""
     for place in range(point.size):
-        top, left = row[place], column[place]
+        top, left = row[place] - above, column[place]
         total = 0.0
         for i in range(3):
             instant = 0.0
@@ -105,9 +105,9 @@ def smooth_rows(image, kernel, lags, rows, margin, result):
         for i in range(line.size):
             line[i] = 0
         tap, end = 0, taps
-        while tap < end and not 0 <= source - lags[tap] < height:
+        while tap < end and not (kernel[tap] != 0 and 0 <= source - lags[tap] < height):
             tap += 1
-        while end > tap and not 0 <= source - lags[end - 1] < height:
+        while end > tap and not (kernel[end - 1] != 0 and 0 <= source - lags[end - 1] < height):
             end -= 1
         # Four rows at a time, as whole lines: the sums stay in registers, and an index into two
         # dimensions would be checked for every pixel.

@@ -318,8 +318,16 @@ class SurfaceModel:
         # rows before and behind the streak image whose light reaches it later or earlier
         self.before = int(max(self.pulse.lags.max(), 0))
         self._rows = self.before + self.image.shape[0] + int(max(-self.pulse.lags.min(), 0))
-        self.footprints = self._map_views(self._spread_view)
+        self.footprints = self.map_parallel(self._spread_view, self.camera.views)
         self.kernels = [self.make_kernel(view) for view in range(self.camera.views)]
+        # rows that light of any view reaches, as those of `Footprint` count, and of the streak image
+        rows = np.concatenate([place.lit_rows for place in self.footprints])
+        last = int(rows.max(initial=-1)) + 1
+        self._lit_before = slice(int(rows.min(initial=last)), last)
+        first = self._lit_before.start - self.before + int(self.pulse.lags.min())
+        last = min(last - self.before + int(self.pulse.lags.max()), self.image.shape[0])
+        self._lit = slice(min(max(first, 0), max(last, 0)), max(last, 0))
+        self._find_shades()
 
     def _find_neighbours(self) -> NDArray[np.intp]:
         """Numbers of the points of the same surface beside each, (2, 2, points): along columns and
@@ -355,8 +363,10 @@ class SurfaceModel:
         columns = self.image.shape[1]
         away, last = margin + samples, rows + margin - samples
         first, shares = kernels.split_between_rows(np.clip(row, -away, rows + away))
-        shares[(first < -margin) | (first > last)] = 0
-        np.clip(first, -margin, last, out=first)
+        dark = (first <= -margin) | (first >= last)
+        shares[dark] = 0
+        seen = first[~dark]  # the others are among these
+        np.clip(first, seen.min(initial=last), seen.max(initial=-margin), out=first)
         slit_first = np.empty(row.size, np.int32)
         slit = np.empty((row.size, SLIT_PIXELS), np.float32)
         along = np.clip(column, -SLIT_PIXELS, columns + SLIT_PIXELS)
@@ -434,6 +444,7 @@ class SurfaceModel:
         behind = (self.distance > nearest[self.pixel]) & (brightness > MIN_BEHIND_FRACTION)
         count = np.bincount(self.surface[behind], minlength=len(self.masks))
         self.behind = behind & (count >= MIN_BEHIND_PX)[self.surface]
+        self._find_shades()
 
     def see(self, streak: Streak) -> SurfaceModel:
         """Return the same surfaces before another shot of the camera."""
@@ -485,13 +496,12 @@ class SurfaceModel:
         apart = np.maximum((before != own).astype(int) + (behind != own), 1)
         return np.asarray((self.distance[behind] - self.distance[before]) / apart)
 
-    def _map_views(self, work: Callable[[int], Result]) -> list[Result]:
-        """Return ``work(view)`` of all views; each thread takes its share of them at once."""
-        views = self.camera.views
+    def map_parallel(self, work: Callable[[int], Result], jobs: int) -> list[Result]:
+        """Return ``work(job)`` of all views or surfaces; each thread takes its share of them at once."""
         if self.surface.size < PARALLEL_POINTS:
-            return [work(view) for view in range(views)]
-        shares = split_blocks(views, -(-views // thread_count()))
-        found = map_parallel(lambda share: [work(v) for v in range(views)[share]], shares)
+            return [work(job) for job in range(jobs)]
+        shares = split_blocks(jobs, -(-jobs // thread_count()))
+        found = map_parallel(lambda share: [work(job) for job in range(jobs)[share]], shares)
         return [one for part in found for one in part]
 
     def receive(
@@ -518,25 +528,24 @@ class SurfaceModel:
         from tofclip.recovery.surfaces.kernels import add_light, smooth_rows
 
         place, margin, samples = self.footprints[view], self._margin, 3
-        amplitude = self.shade(view, amplitude, part)
-        part = self.places.find(part)
-        parts = self.places.point[part], self.places.share[part]
-        row, column = place.row[part], place.column[part]
-        if not row.size:
+        amplitude, lit = self.shade(view, amplitude, part), place.lit_rows
+        first, last = self._lit_before.start, self._lit_before.stop
+        left, right = 0, place.columns
+        own = self.places.find(part)
+        row, column = place.row[own], place.column[own]
+        if not (row.size and lit.size):
             return 0, np.zeros((0, 0), np.float32)
-        first = max(int(row.min()) - self.half, 0)
-        last = max(min(int(row.max()) + samples + self.half, self._rows), first)
-        left = int(column.min())
-        light = np.zeros(
-            (last - first + 2 * margin, int(column.max()) + SLIT_PIXELS - left), np.float32
-        )
-        down = row + np.int32(margin - first), place.row_shares[part]
-        add_light(amplitude, *parts, *down, column - np.int32(left), place.slit_shares[part], light)
+        if part != slice(None):
+            first = max(int(row.min()) - self.half, 0)
+            last = max(min(int(row.max()) + samples + self.half, self._rows), first)
+            left, right = int(column.min()), int(column.max()) + SLIT_PIXELS
+            lit = np.arange(first, last)
+        light = np.zeros((last - first + 2 * margin, right - left), np.float32)
+        parts = self.places.point[own], self.places.share[own]
+        down, across = (row, place.row_shares[own]), (column, place.slit_shares[own])
+        add_light(amplitude, *parts, *down, *across, first - margin, left, light)
         image = np.zeros((last - first, light.shape[1]), np.float32)
-        lit = (
-            np.arange(last - first) if row.size < self.places.point.size else place.lit_rows - first
-        )
-        smooth_rows(light, kernel, np.arange(-self.half, self.half + 1), lit, margin, image)
+        smooth_rows(light, kernel, np.arange(-self.half, self.half + 1), lit - first, margin, image)
         return first, image
 
     def _cut_to_slit(self, view: int, part: slice, width: int) -> tuple[slice, slice]:
@@ -561,32 +570,55 @@ class SurfaceModel:
 
     def render(self, amplitude: Image) -> Image:
         """Return A a, (rows, columns)."""
-        total = np.zeros((self._rows, self.image.shape[1]), np.float32)
+        image = np.zeros_like(self.image)
+        image[self._lit] = self._render_lit(amplitude)
+        return image
+
+    def _render_lit(self, amplitude: Image) -> Image:
+        """The rows of A a that light reaches."""
+        above = self._lit_before.start
+        total = np.zeros((self._lit_before.stop - above, self.image.shape[1]), np.float32)
         kernels = [
             kernel * np.float32(gain)
             for kernel, gain in zip(self.kernels, self.state.gains, strict=True)
         ]
         everywhere = slice(None)
-        for view, (top, light) in enumerate(
-            self._map_views(lambda v: self._project(v, amplitude, kernels[v], everywhere))
-        ):
+        seen = self.map_parallel(
+            lambda view: self._project(view, amplitude, kernels[view], everywhere), len(kernels)
+        )
+        for view, (top, light) in enumerate(seen):
             own, slit = self._cut_to_slit(view, everywhere, light.shape[1])
-            total[top : top + len(light), slit] += light[:, own]
-        return self._trail(total, self.before, self.image.shape[0])
+            total[top - above : top - above + len(light), slit] += light[:, own]
+        rows = self._lit.stop - self._lit.start
+        return self._trail(total, self._lit.start + self.before - above, rows)
+
+    def pull(self, amplitude: Image, image: Image | None = None) -> Image:
+        """Return A'W(A a - image), (points,), how the misfit changes with amplitudes; without an image
+        A'WA a.
+        """
+        rest = self._render_lit(amplitude)
+        if image is not None:
+            rest = rest - image[self._lit]
+        return self._gather_lit(self.weights[self._lit] * rest)
 
     def gather(self, image: Image, squared: bool = False) -> Image:
         """Return A' of an image, (points,); squared: with the squares of all entries."""
+        return self._gather_lit(image[self._lit], squared)
+
+    def _gather_lit(self, image: Image, squared: bool = False) -> Image:
+        """The same of its rows that light reaches."""
         from tofclip.recovery.surfaces.kernels import gather_light, smooth_rows
 
         lags = np.arange(-self.half, self.half + 1)
-        seen = np.zeros((self._rows, image.shape[1]), np.float32)
-        if squared or not self.pulse.reach:
-            seen[self.before : self.before + len(image)] = image
+        seen, above = image, self._lit.start + self.before
+        if squared:
             reach = self.half + self.pulse.reach
             lags = np.arange(-reach, reach + 1)
-        else:
-            shares = self.pulse.shares.astype(np.float32)
-            smooth_rows(image, shares, -self.pulse.lags, np.arange(self._rows), -self.before, seen)
+        elif self.pulse.reach:
+            shares, rows = self.pulse.shares.astype(np.float32), self._lit_before
+            seen = np.empty((rows.stop - rows.start, image.shape[1]), np.float32)
+            margin, above = rows.start - above, rows.start
+            smooth_rows(image, shares, -self.pulse.lags, np.arange(len(seen)), margin, seen)
 
         def work(view: int) -> Image:
             place, kernel = self.footprints[view], self.kernels[view]
@@ -595,33 +627,29 @@ class SurfaceModel:
                 whole = self.pulse.extend(self.make_kernel(view, variance=0.0))
                 kernel, gain, slit_shares = whole**2, gain**2, slit_shares**2
             own, slit = self._cut_to_slit(view, slice(None), place.columns)
-            part = np.zeros((self._rows, place.columns), np.float32)
+            part = np.zeros((len(seen), place.columns), np.float32)
             part[:, own] = seen[:, slit]
             smooth = np.empty((self._rows + 2 * self._margin, place.columns), np.float32)
-            smooth_rows(part, kernel, -lags, place.reached_rows, -self._margin, smooth)
+            smooth_rows(part, kernel, -lags, place.reached_rows, -self._margin - above, smooth)
             found, parts = np.zeros(self.surface.size, np.float32), self.places
-            down = place.row + np.int32(self._margin), place.row_shares
-            light = parts.point, parts.share, *down, place.column, slit_shares
-            gather_light(smooth, gain, *light, found)
+            light = parts.point, parts.share, place.row, place.row_shares, place.column, slit_shares
+            gather_light(smooth, gain, *light, -self._margin, found)
             if squared:
                 found *= self.places.overlap
             found = self.shade(view, found)
             return self.shade(view, found) if squared else found
 
         total = np.zeros(self.surface.size, np.float32)
-        for found in self._map_views(work):
+        for found in self.map_parallel(work, self.camera.views):
             total += found
         return total
 
     def shade(self, view: int, amplitude: Image, part: slice = slice(None)) -> Image:
         """Return amplitudes, of the points in `part`, as a view sees them."""
-        shaded = amplitude.astype(np.float32)
-        if self.state.shading[:, view].any():
-            behind = np.flatnonzero(self.behind[part])
-            shaded[behind] *= np.exp(self.state.shading[:, view])[self.surface[part][behind]]
-        if self.state.borders.any():
-            first, last, _ = part.indices(self.surface.size)
-            own = slice(*np.searchsorted(self.outer, [first, last]))
-            seen = 1 + self.state.borders[0] * self.excess[view, own]
-            shaded[self.outer[own] - first] *= np.maximum(seen, 0)
-        return shaded
+        return np.asarray(amplitude * self._shades[view, part], np.float32)
+
+    def _find_shades(self) -> None:
+        """How bright each view sees each point, (views, points), beside its amplitude."""
+        shading = np.exp(np.where(self.behind, self.state.shading.T[:, self.surface], 0))
+        shading[:, self.outer] *= np.maximum(1 + self.state.borders * self.excess, 0)
+        self._shades = shading.astype(np.float32)

@@ -104,6 +104,18 @@ def find_patches(
     """Find the smooth surfaces in a picture's returns, (n,) each, the largest first. A pixel may
     have several returns.
     """
+    found = find_plain_patches(pixels, distance, deviation, ray_length, bin_m)
+    return [_bend_where_needed(patch, bin_m) for patch in found]
+
+
+def find_plain_patches(
+    pixels: Pixels,
+    distance: FloatArray,
+    deviation: FloatArray,
+    ray_length: FloatArray,
+    bin_m: float,
+) -> list[Patch]:
+    """The same, all of them quadratics: which returns belong together."""
     if pixels.size == 0:
         return []
     patches = _split(_fit_quadratic(pixels, distance, deviation, ray_length), bin_m)
@@ -118,8 +130,7 @@ def find_patches(
                     patches[first] = joint
                     del patches[second]
             first += 1
-    patches.sort(key=lambda patch: -patch.pixels.size)
-    return [_bend_where_needed(patch, bin_m) for patch in patches]
+    return sorted(patches, key=lambda patch: -patch.pixels.size)
 
 
 def _split(patch: Patch, bin_m: float) -> list[Patch]:
@@ -316,14 +327,16 @@ def find_dimmer_patches(
     deviation = returns.confidence[free].astype(np.float64)
     light = MIN_DIMMER_LIGHT * float(returns.intensity.sum())
     found = []
-    for patch in find_patches(pixel, distance, deviation, ray_length, bin_m):
+    for plain in find_plain_patches(pixel, distance, deviation, ray_length, bin_m):
+        if plain.pixels.size < MIN_DIMMER_PX:
+            break
+        patch = _bend_where_needed(plain, bin_m)
         own = np.isin(pixel, patch.pixels)
         own &= np.abs(distance - patch.compute_ranges(pixel)) < NEIGHBOUR_BINS * bin_m
         here = patch.compute_ranges(patch.pixels)
         apart = [np.median(np.abs(here - one.compute_ranges(patch.pixels))) for one in patches]
         if (
-            patch.pixels.size >= MIN_DIMMER_PX
-            and float(intensity[own].sum()) > light
+            float(intensity[own].sum()) > light
             # noise far out of a surface's pulse makes no surface of its own
             and patch.compute_error() < DIMMER_BINS * bin_m
             and min(apart, default=np.inf) > DIMMER_REACH_BINS * bin_m

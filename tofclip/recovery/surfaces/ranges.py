@@ -412,7 +412,7 @@ def measure_local_shifts(model: SurfaceModel, amplitude: Image, rest: Image) -> 
     ]
     moved = amplitude * np.float32(1 / model.row_m)  # rows for a metre
     pull = moved * apart.gather(model.weights * rest)
-    known = moved * apart.gather(model.weights * apart.render(moved))
+    known = moved * apart.pull(moved)
     # of a pulse's slope are the squares 1 / (2 sigma^2) of its own
     alone = moved**2 * model.gather(model.weights, squared=True) / (2 * model.pulse.sigma**2)
     most = model.pulse.sigma * model.row_m

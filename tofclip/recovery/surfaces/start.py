@@ -26,9 +26,11 @@ from tofclip.recovery.surfaces.patches import (
     Patch,
     find_dimmer_patches,
     find_patches,
+    find_plain_patches,
     reach_further,
 )
 from tofclip.recovery.surfaces.pulse import Image, ShotPulse, measure_pulse
+from tofclip.recovery.surfaces.shapes import Pixels
 from tofclip.shots import Frames, Returns, Streak
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -139,7 +141,7 @@ def _leave_out_doubtful(found: Returns, ray_length: FloatArray, bin_m: float) ->
     sure = ~(found.false_alarm > SURE_FALSE_ALARM)
     pixel = found.y.astype(np.intp) * ray_length.shape[1] + found.x
     kept = sure.copy()
-    for patch in find_brightest_patches(found, ray_length, bin_m):
+    for patch in find_plain_patches(*_list_strongest(found), ray_length, bin_m):
         own = np.isin(pixel, patch.pixels)
         if sure[own].mean() < MIN_SURE_FRACTION:
             kept |= own
@@ -150,11 +152,16 @@ def find_brightest_patches(returns: Returns, ray_length: FloatArray, bin_m: floa
     """Patches of each pixel's strongest return: weaker ones are often the frames' own, and would widen
     the surfaces.
     """
+    return find_patches(*_list_strongest(returns), ray_length, bin_m)
+
+
+def _list_strongest(returns: Returns) -> tuple[Pixels, FloatArray, FloatArray]:
+    """Pixels, ranges and deviations of each pixel's strongest return, (n,) each."""
     strongest, deviation = (
         returns.image(name).astype(np.float64).ravel() for name in ("range", "confidence")
     )
     pixels = np.flatnonzero(np.isfinite(strongest))
-    return find_patches(pixels, strongest[pixels], deviation[pixels], ray_length, bin_m)
+    return pixels, strongest[pixels], deviation[pixels]
 
 
 def _measure_light(found: Returns, where: NDArray[np.bool_]) -> float:
