@@ -29,7 +29,7 @@ def recover(scene, photons):
     [
         ("wires", 0.03, 0.06, 1.3, 0.07),
         pytest.param("room", 0.05, 0.01, 1.9, 0.33, marks=pytest.mark.nightly),
-        pytest.param("table", 0.08, 0.01, 2.5, 0.2, marks=pytest.mark.nightly),
+        pytest.param("table", 0.08, 0.01, 2.7, 0.2, marks=pytest.mark.nightly),
     ],
 )
 def test_dim_and_small_things_are_seen_beside_bright_ones(
@@ -54,7 +54,7 @@ def test_dim_and_small_things_are_seen_beside_bright_ones(
     near = (np.diff(pixel) == 0) & (np.diff(returns.range) < 0.02)
     assert near.mean() < 0.02
     # each surface is about as far off as it says: 0.67 to 0.94 in the room, whose balls had 0.15; twice
-    # of what seed 2 has and half of it, but 2.45 of an apple that is 10 px wide
+    # of what seed 2 has and half of it, but 2.60 of an apple that is 10 px wide
     assert too_large < min(score["z"].values()), score["z"]
     assert max(score["z"].values()) < too_small, score["z"]
     # none is without a probability of being false, and few that seem sure are: 0.04 of wires, where
@@ -76,6 +76,15 @@ def test_a_wall_that_goes_on_beyond_the_picture_is_not_tilted():
     truth = np.full((96, 96), np.nan)
     truth[row, column] = shot.truth[:, 2]
     assert np.nanstd(found.range - truth[found.y, found.x]) < 0.09e-3
+
+
+@pytest.mark.nightly
+def test_leaves_are_kept_in_little_light():
+    """Those too small for a surface are the frames' returns, which the whole shot shows to be there."""
+    _, score = recover("bush", 200)
+    # 0.11; 0.16 where each had to stand ten deviations out of the noise
+    assert score["miss"] < 0.13
+    assert score["false"] < 0.005
 
 
 def test_a_dark_shot_is_called_dark():

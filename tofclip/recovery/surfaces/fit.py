@@ -59,6 +59,11 @@ UPPER_QUANTILE = 0.9
 # Of what certainly is a surface, and beyond: points that are fainter are looked at no further.
 LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 3.5, 0.05, 3
 
+# Logarithm of the odds that a return of the frames beside the surfaces is false: nothing known, for each
+# deviation out of the noise that the whole shot shows, where there are few, and for each e-fold of the
+# odds that the frames alone give it. From scenes of known returns.
+OTHER_ODDS, ENOUGH_SIGMAS, LEAST_DOUBT = np.array([5.7, -0.56, 1.96]), 15.0, 1e-4
+
 Places = tuple[NDArray[Any], NDArray[Any], FloatArray]
 
 
@@ -289,18 +294,20 @@ def _find_others(
     surfaces and all other returns free to take over their light; and the light of all.
     """
     model = solver.model
-    chosen, significance = find_candidates(solver, Detection.signal_to_noise)
+    chosen, _ = find_candidates(solver, Detection.signal_to_noise)
     points = model.row[chosen], model.column[chosen], model.distance[chosen]
     near = find_near((found.y, found.x, found.range), points, model.row_m)
     others = found[~near]
     if not len(others):
         return others, solver
-    lit = significance[significance > LIT_SIGMAS]
-    least = max(LIT_SIGMAS, _find_sure_level(lit, LIT_SIGMAS) / 2)
     together, own = _add_returns(solver, others, tick)
     weights = together.model.weights / together.estimate_local_variance()
     information = together.model.gather(weights, squared=True)[own]
-    others = others[together.amplitude[own] * np.sqrt(information) > least]
+    shown = np.minimum(together.amplitude[own] * np.sqrt(information), ENOUGH_SIGMAS)
+    doubt = np.clip(np.nan_to_num(others.false_alarm, nan=SURE_FALSE_ALARM), LEAST_DOUBT, 0.5)
+    known = [np.ones(shown.size), shown, scipy.special.logit(doubt)]
+    doubt = scipy.special.expit(OTHER_ODDS @ np.array(known)).astype(np.float32)
+    others = replace(others, false_alarm=doubt)[doubt < 0.5]
     # light of those that are left out goes to the others
     return others, _add_returns(solver, others, tick)[0]
 
