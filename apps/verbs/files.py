@@ -150,7 +150,7 @@ def _format_plain(value: Any) -> str:
         return f"[{', '.join(map(_format_plain, value))}]" if value else "none"
     if isinstance(value, float):
         return f"{value:.6g}"
-    return "not known" if value is None else str(value)
+    return "-" if value is None else str(value)
 
 
 def _format_values(values: Any) -> str:
