@@ -496,9 +496,16 @@ def _eliminate_amplitude(
                 image[group.area] += np.tensordot(
                     functions[:, number].astype(np.float32), group.images, 1
                 )
-        if start is not None:
+        if change.any():
             image -= model.render(change)
         change += explain_by_amplitude(model, image, scale, iterations)
+        if start is None and number == 0:
+            # a smooth multiple of a derivative takes nearly that multiple of its change
+            for surface, (functions, _) in enumerate(shares):
+                part = model.parts[surface]
+                multiples = (model.derivatives[surface] @ functions).T
+                changes[1 : len(multiples), part] = multiples[1:] * change[part]
+            iterations = FURTHER_ELIMINATION_ITERATIONS
 
     def explain(surface: int) -> list[Derivatives]:
         part = model.parts[surface]

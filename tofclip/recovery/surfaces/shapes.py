@@ -31,7 +31,8 @@ TINY = float(np.finfo(np.float32).eps)
 # is sqrt(q) at the pixel's middle, of which as much is rounded off.
 LIMB = 0.44
 LIMB_LEVELS = np.array([1.0, 1.5, 2.0, 3.0, 5.0])
-FIT_ROUNDS, FIT_STEPS = 8, 30
+# Of robust fits: each only has to be nearer than the one before, whose errors it weighs by.
+FIT_ROUNDS, FIT_STEPS, FIT_TOLERANCE = 8, 30, 1e-3
 
 
 @dataclass(frozen=True)
@@ -207,6 +208,7 @@ def fit_quadric(
     # frames' returns at a limb are far too near, all of them: what the others do not share hardly counts
     for _ in range(FIT_ROUNDS):
         scale = float(np.median(np.abs(measure(found)))) + TINY
-        settings = {"loss": "arctan", "f_scale": scale, "x_scale": "jac", "max_nfev": FIT_STEPS}
+        settings = {"loss": "arctan", "f_scale": scale, "x_scale": "jac"}
+        settings |= {"ftol": FIT_TOLERANCE, "max_nfev": FIT_STEPS}
         found = scipy.optimize.least_squares(measure, found, differentiate, **settings).x
     return basis, found
