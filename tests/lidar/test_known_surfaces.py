@@ -27,7 +27,7 @@ def recover(scene, photons):
 @pytest.mark.parametrize(
     ("scene", "missed", "false", "too_small", "too_large"),
     [
-        ("wires", 0.03, 0.06, 1.3, 0.07),
+        ("wires", 0.03, 0.06, 2.0, 0.13),
         pytest.param("room", 0.05, 0.01, 1.9, 0.33, marks=pytest.mark.nightly),
         pytest.param("table", 0.08, 0.01, 2.7, 0.2, marks=pytest.mark.nightly),
     ],

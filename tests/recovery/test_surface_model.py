@@ -498,7 +498,8 @@ def test_what_steps_take_from_the_misfit_is_given_back():
 
 def test_a_deviation_is_that_of_the_fit_of_further_steps_and_of_the_centres():
     """Of two planes of which all is known: r = length / (a + b x), so that
-    dr = r^2 / length sqrt(var a + x^2 var b); to that what steps leave, and the displaced picture.
+    dr = r^2 / length sqrt(var a + x^2 var b); to that what steps leave, and the displaced picture. Where
+    the farther plane is seen through the nearer one, each view sees another part of a pixel.
     """
     model = make_model(simulate_shot(SCENE, INSTRUMENT, seed=0).streak)
     amplitude = np.full(model.surface.size, 500, np.float32)
@@ -534,7 +535,13 @@ def test_a_deviation_is_that_of_the_fit_of_further_steps_and_of_the_centres():
         stated = distance**2 / length * np.hypot(one, across * along)
         right, down = estimate_displacement(CAMERA, centre_error)
         moved = np.hypot(right * (reach(x + 1, y) - distance), down * (reach(x, y + 1) - distance))
-        expected = np.sqrt(stated**2 + remainder[surface] ** 2 + moved**2)
+        through = (surface == 1) & model.masks[0, y, x]
+        steep = np.hypot(
+            reach(x + 0.5, y) - reach(x - 0.5, y), reach(x, y + 0.5) - reach(x, y - 0.5)
+        )
+        # half of the light is the nearer one's
+        hidden = through * 0.5 / np.sqrt(12 * CAMERA.views) * steep
+        expected = np.sqrt(stated**2 + remainder[surface] ** 2 + moved**2 + hidden**2)
         np.testing.assert_allclose(found.confidence[own], expected, rtol=1e-3)
         # light falls with the square of the range
         np.testing.assert_allclose(found.intensity[own], 500 * distance**2, rtol=1e-5)

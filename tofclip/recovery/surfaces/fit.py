@@ -38,10 +38,10 @@ from tofclip.solvers import Progress, ignore_progress
 from tofclip.threads import limit_blas_threads
 
 START_ITERATIONS = 25
-MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 4, 10
+MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 6, 10
 AGAINST_DIM = 3.0  # until ranges are known; then amplitudes are as the shot has them
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
-LAST_STEP_SIGMAS = 0.3
+LAST_STEP_SIGMAS = 0.15
 # Where the last shot's fit begins: before and after the ranges' step, and how far beyond the returns
 # of quick frames surfaces may reach.
 FOLLOWING_ITERATIONS, FOLLOWING_MARGIN_PX = 10, 4

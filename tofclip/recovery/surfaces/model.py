@@ -53,7 +53,7 @@ PART_ROWS, MAX_PARTS = 1.5, 6
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
 SWEEP_LEFT_FRACTION = (
-    0.15  # of the corrections to a sweep, which are lines: what is left of its shape
+    0.1  # of the corrections to a sweep, which are lines: what is left of its shape
 )
 PARALLEL_POINTS = 20_000  # threads take as long to begin as so many need
 MIN_BEHIND_PX = 100  # of a surface, seen through another; fewer are a rim, of which each has a part
@@ -262,7 +262,7 @@ class SurfaceModel:
         axis_row, axis_column = self.camera.optical_axis_px
         self._x, self._y = self.column - axis_column, self.row - axis_row
         self.ray_length = 1 / self._directions[:, 2]
-        self._beside = self._find_neighbours()
+        self.beside = self._find_neighbours()
         self.outer = np.flatnonzero(np.isin(self.column, [0, masks.shape[2] - 1]))
         self.behind = np.zeros(self.surface.size, bool)
 
@@ -491,7 +491,7 @@ class SurfaceModel:
 
     def compute_slopes(self) -> FloatArray:
         """Return how steeply the ranges change along columns and rows, (2, points), m per pixel."""
-        before, behind = self._beside[:, 0], self._beside[:, 1]
+        before, behind = self.beside[:, 0], self.beside[:, 1]
         own = np.arange(self.distance.size)
         apart = np.maximum((before != own).astype(int) + (behind != own), 1)
         return np.asarray((self.distance[behind] - self.distance[before]) / apart)
@@ -605,8 +605,18 @@ class SurfaceModel:
         """Return A' of an image, (points,); squared: with the squares of all entries."""
         return self._gather_lit(image[self._lit], squared)
 
+    def gather_views(self, image: Image) -> list[Image]:
+        """Return what each view adds to A' of an image, (points,) each."""
+        return self._gather_each(image[self._lit], False)
+
     def _gather_lit(self, image: Image, squared: bool = False) -> Image:
-        """The same of its rows that light reaches."""
+        """A' of the rows of an image that light reaches."""
+        total = np.zeros(self.surface.size, np.float32)
+        for found in self._gather_each(image, squared):
+            total += found
+        return total
+
+    def _gather_each(self, image: Image, squared: bool) -> list[Image]:
         from tofclip.recovery.surfaces.kernels import gather_light, smooth_rows
 
         lags = np.arange(-self.half, self.half + 1)
@@ -639,10 +649,7 @@ class SurfaceModel:
             found = self.shade(view, found)
             return self.shade(view, found) if squared else found
 
-        total = np.zeros(self.surface.size, np.float32)
-        for found in self.map_parallel(work, self.camera.views):
-            total += found
-        return total
+        return self.map_parallel(work, self.camera.views)
 
     def shade(self, view: int, amplitude: Image, part: slice = slice(None)) -> Image:
         """Return amplitudes, of the points in `part`, as a view sees them."""

@@ -24,7 +24,7 @@ from tofclip.camera import Camera
 from tofclip.recovery.surfaces.amplitudes import TINY, explain_by_amplitude, scale_amplitude
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, Window
 from tofclip.recovery.surfaces.pulse import Image, differentiate_pulse
-from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS
+from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, QuadricBasis
 from tofclip.threads import map_parallel
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -33,6 +33,7 @@ CLUSTER_ROWS, CLUSTER_COLUMNS = 12, 48  # measurements whose misfits may depend 
 LEAST_VARIANCE = 1e-12  # of the largest one
 MAX_LEVERAGE = 0.9  # of a cluster: what it alone determines, its misfit says nothing about
 SMALLEST_STEP = 1 / 16  # of a Gauss-Newton step, halved until it lowers the misfit
+REMEMBERED_STEPS = 2  # from which the next one's length is taken
 # Rows by which each view's part of a sweep that was found from the shot is off: root mean squares of
 # scenes by a forward model of their own (0.015 and 0.05 in the demonstration). Later views and farther
 # surfaces look alike, so that the mean over the views is what all ranges have in common.
@@ -53,10 +54,11 @@ ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 12, 4
 # What the prior takes from amplitudes is as fine as they are. After 6 the ranges of a wall behind
 # wires were 0.009 mm too near, without noise and with the model exact; after 15, 0.0005 mm.
 FREE_ITERATIONS, FURTHER_FREE_ITERATIONS, MOVED_FREE_ITERATIONS = 15, 6, 3
-# Of local shifts: the side of the square that moves together, the least that is known of one,
-# 1/m^2: a metre, variances of its noise that show nothing, and what is left of the information of all
-# points alone where it cancels.
-LOCAL_PX, LEAST_INFORMATION, SHIFT_NOISE, CANCELLED = 3, 1.0, 2.0, 0.1
+# Middle of a part of a pixel from the pixel's own, root mean square over parts of all sizes.
+PARTLY_FILLED_PX = 1 / np.sqrt(12)
+# Of local shifts: the side of the square that moves together, and the least that is known of one.
+LOCAL_PX, LEAST_INFORMATION = 5, 1.0
+
 Unknown = tuple[str, int, int]
 RIDGE = 1e-6  # of each unknown's own information: for what the shot says nothing about
 
@@ -310,6 +312,30 @@ class Refinement:
     rest: Image
     # amplitudes that explain this shot best without the prior, if it is this shot's step
     free: Image | None
+    history: tuple[Step, ...] = ()  # the last steps on this shot, the last one first
+
+
+class Step(NamedTuple):
+    """A step as Gauss and Newton have it, and as it was taken, (unknowns,) both."""
+
+    names: list[Unknown]
+    told: FloatArray
+    taken: FloatArray
+
+
+def lengthen_step(change: FloatArray, history: Sequence[Step], metric: FloatArray) -> FloatArray:
+    """Return a step from what it and those before it have in common. What amplitudes can explain of views
+    that are late makes each too short, by the same fraction along the same directions: the sum of these
+    that is nearest to none leads where steps would end (D. Anderson, J. ACM 12, 547, 1965). `metric`:
+    of the normal equations, (unknowns, unknowns).
+    """
+    told = [change, *(step.told for step in history)]
+    changed = np.array([a - b for a, b in itertools.pairwise(told)])
+    weighted = changed @ metric
+    known = weighted @ changed.T
+    shares, *_ = np.linalg.lstsq(known, weighted @ change, rcond=None)
+    taken = np.array([step.taken for step in history])
+    return np.asarray(change - shares @ (taken + changed))
 
 
 def refine_state(
@@ -323,6 +349,7 @@ def refine_state(
     place; the mean gain stays, and so does the mean brightness behind a surface. What the step
     before this one (`earlier`) knew saves work.
     """
+    given, model.weights = model.weights, doubt_borders(model, amplitude)
     error = model.image - model.render(amplitude)
     scale = scale_amplitude(model, amplitude > 0)
 
@@ -354,7 +381,10 @@ def refine_state(
     unit = np.sqrt(np.diag(equations.normal)) + TINY
     whole = (equations.normal + second) / np.outer(unit, unit) + RIDGE * np.eye(unit.size)
     inverse = np.linalg.inv(whole) / np.outer(unit, unit)
-    change = inverse @ (equations.slope - first)
+    told = inverse @ (equations.slope - first)
+    history = () if earlier is None or earlier.free is None else earlier.history
+    history = tuple(itertools.takewhile(lambda step: step.names == names, history))
+    longer = [lengthen_step(told, history, equations.normal + second)] if history else []
     covariance = inverse
     if robust:
         covariance = equations.estimate_covariances(inverse, second, error)
@@ -366,26 +396,55 @@ def refine_state(
 
     # 4. With as many iterations before the step as after it, so that these alone do not make it good.
     # A step that is far too long may overflow: it is refused like others that lower nothing.
-    state, step = model.state, 1.0
     settled, left = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
-    before = compute_objective(model, left)
+    before, state = compute_objective(model, left), model.state
     moved, free, rest = amplitude, amplitude + settled, left
+    halved = np.outer(0.5 ** np.arange(1 - np.log2(SMALLEST_STEP)), told)
     with np.errstate(over="ignore", invalid="ignore"):
-        while step >= SMALLEST_STEP:
-            ahead = _move(model, state, amplitude, names, step * change, changes)
+        for taken in (*longer, *halved):
+            ahead = _move(model, state, amplitude, names, taken, changes)
             error = model.image - model.render(ahead)
             settled, left = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
             if compute_objective(model, left) < before:
                 moved, free, rest = ahead, ahead + settled, left
+                history = (Step(names, told, taken), *history)
                 break
-            step /= 2
         else:
             model.place(state)
     numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
     own = [np.ix_(numbers == surface, numbers == surface) for surface in range(len(model.masks))]
     covariances = [covariance[block] for block in own]
     steps = 1 if earlier is None else earlier.steps + 1
-    return Refinement(covariances, moved, changes, steps, rest, free)
+    model.weights = given
+    return Refinement(covariances, moved, changes, steps, rest, free, history[:REMEMBERED_STEPS])
+
+
+def doubt_borders(model: SurfaceModel, amplitude: Image) -> Image:
+    """Return the weights of measurements, (rows, columns), with what pixels that a surface fills in part
+    add to their variance: their light comes from any part of the pixel, and where the surface is steep
+    that is a range of its own, by which the whole of it would be turned or moved.
+    """
+    own = np.arange(amplitude.size)
+    light = [[np.where(side == own, 0, amplitude[side]) for side in pair] for pair in model.beside]
+    uneven = [np.abs(a - b) / np.maximum(a + b, TINY) for a, b in light]
+    late = PARTLY_FILLED_PX * np.hypot(*(np.array(uneven) * model.compute_slopes())) / model.row_m
+    late *= np.array([not isinstance(basis, QuadricBasis) for basis in model.bases])[model.surface]
+    moved = delay_light(model).render((amplitude * late).astype(np.float32))
+    seen = model.weights > 0
+    return np.where(seen, 1 / (1 / np.where(seen, model.weights, 1) + moved**2), 0).astype(
+        np.float32
+    )
+
+
+def delay_light(model: SurfaceModel) -> SurfaceModel:
+    """Return the model whose light is what later light of the surfaces changes, for a row."""
+    apart = copy.copy(model)
+    pairs = zip(model.kernels, model.footprints, strict=True)
+    apart.kernels = [
+        (differentiate_pulse(kernel) * place.rows_per_instant).astype(np.float32)
+        for kernel, place in pairs
+    ]
+    return apart
 
 
 def _explain_rest(
@@ -399,43 +458,36 @@ def _explain_rest(
 
 
 def measure_local_shifts(model: SurfaceModel, amplitude: Image, rest: Image) -> FloatArray:
-    """Return by how much the light of each point and of those beside it arrives later, (points,), m,
-    than on its surface, as far as the misfit that is left shows it and noise does not: what
-    the surface's functions do not follow, as at the rim of a ball. A pulse's width is the most that
-    a shift of light shows.
+    """Return by how much the light of each point and of those about it arrives later, (points,), m,
+    root mean square, than on its surface: what the surface's functions do not follow, as at the rim of
+    a ball. A pulse's width is the most that a shift of light shows.
+
+    Noise and what else the model does not explain is another in each view, a range is the same in all:
+    products of different views' shifts are on average the shift's square, whatever the misfit's size.
     """
-    apart = copy.copy(model)
-    pairs = zip(model.kernels, model.footprints, strict=True)
-    apart.kernels = [
-        (differentiate_pulse(kernel) * place.rows_per_instant).astype(np.float32)
-        for kernel, place in pairs
-    ]
-    moved = amplitude * np.float32(1 / model.row_m)  # rows for a metre
-    pull = moved * apart.gather(model.weights * rest)
-    known = moved * apart.pull(moved)
-    # of a pulse's slope are the squares 1 / (2 sigma^2) of its own
-    alone = moved**2 * model.gather(model.weights, squared=True) / (2 * model.pulse.sigma**2)
-    most = model.pulse.sigma * model.row_m
-    shifts = np.zeros(amplitude.size)
+    apart, moved = delay_light(model), amplitude * np.float32(1 / model.row_m)
+    pull = np.array(apart.gather_views(model.weights * rest)) * moved
+    known = np.array(apart.gather_views(model.weights * apart.render(moved))) * moved
+    most, shifts = (model.pulse.sigma * model.row_m) ** 2, np.zeros(amplitude.size)
     for part, mask in zip(model.parts, model.masks, strict=True):
-        pictures = np.zeros((3, *mask.shape))
-        pictures[:, mask] = pull[part], known[part], alone[part]
-        near, weight, variance = (
-            LOCAL_PX**2 * scipy.ndimage.uniform_filter(one, LOCAL_PX, mode="constant")[mask]
-            for one in pictures
+        pictures = np.zeros((2, len(pull), *mask.shape))
+        pictures[:, :, mask] = pull[:, part], known[:, part]
+        sums = LOCAL_PX**2 * scipy.ndimage.uniform_filter(
+            pictures, LOCAL_PX, mode="constant", axes=(2, 3)
         )
-        variance = np.maximum(variance, LEAST_INFORMATION)
-        weight = np.maximum(np.abs(weight), LEAST_INFORMATION)
-        squares, noise = np.minimum(np.abs(near) / weight, most) ** 2, variance / weight**2
-        # where a surface is steep, what neighbours that move along say cancels: there it is taken to be
-        # as far off as elsewhere, where it is seen best, and three deviations of that. Of a square of a
-        # normal error the variance is 2 noise^2, and neighbours share theirs
-        sure = np.where(amplitude[part] > 0, noise**-2, 0)
-        total = max(float(np.sum(sure)), TINY)
-        usual = max(np.sum(sure * (squares - noise)) / total, 0)
-        usual += 3 * np.sqrt(2 * LOCAL_PX**2 / total)
-        own = np.maximum(squares - np.minimum(SHIFT_NOISE * noise, 1 / weight), 0)
-        shifts[part] = np.sqrt(np.where(weight < CANCELLED * variance, usual, own))
+        products, sure = (one.sum(0) ** 2 - (one**2).sum(0) for one in sums[:, :, mask])
+        sure = np.maximum(sure, LEAST_INFORMATION)
+        squares = sums[0][:, mask] ** 2
+        noise = 2 * (squares.sum(0) ** 2 - (squares**2).sum(0))  # of products, if there is no shift
+        # what all of the surface shows, and of what a place shows beyond it as much as is no noise
+        # (empirical Bayes)
+        total = max(float(sure.sum()), LEAST_INFORMATION)
+        usual = max(float(products.sum()) / total, 0.0)
+        usual += LOCAL_PX * float(np.sqrt(noise.sum())) / total
+        beyond = products - usual * sure
+        spread = max(np.sum(beyond**2 - noise), 0.0)
+        own = usual + spread * sure * beyond / (spread * sure**2 + noise * np.sum(sure**2) + TINY)
+        shifts[part] = np.sqrt(np.clip(own, 0, most))
     return shifts
 
 

@@ -14,9 +14,11 @@ from tofclip.lidar import Detection
 from tofclip.lidar.range_calibration import correct_returns
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.fit import SURE_SIGMAS, SurfaceFit, find_candidates, find_near
+from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.patches import rank_within_pixels
-from tofclip.recovery.surfaces.ranges import measure_local_shifts
-from tofclip.recovery.surfaces.shapes import Pixels
+from tofclip.recovery.surfaces.pulse import Image
+from tofclip.recovery.surfaces.ranges import PARTLY_FILLED_PX, measure_local_shifts
+from tofclip.recovery.surfaces.shapes import TINY, Pixels
 from tofclip.shots import Returns
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
@@ -73,7 +75,8 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
         filled = np.sum(1 - doubt[strong][own])
         if filled < ROD_FRACTION * (np.ptp(y[own]) ** 2 + np.ptp(x[own]) ** 2):
             rounded[chosen[own]] = ROD_PX * distance[chosen[own]] / camera.focal_length_px
-    parts = np.stack([fitted, fit.remainder[model.surface], *moved, bent, rounded])
+    hidden = estimate_hidden_shift(model, amplitude)
+    parts = np.stack([fitted, fit.remainder[model.surface], *moved, bent, rounded, hidden])
     deviation = np.sqrt(np.sum(parts**2, axis=0) + model.estimate_sweep_error() ** 2)
     columns: dict[str, Any] = {
         "y": y,
@@ -98,6 +101,19 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
             shear=np.asarray(camera.shear_at(columns["range"])),
         )
     )
+
+
+def estimate_hidden_shift(model: SurfaceModel, amplitude: Image) -> FloatArray:
+    """Return how far off points are, (points,), m, because each view sees them through other gaps of
+    what lies before them: another part of the pixel, and where their surface is steep another range.
+    """
+    order, rank = rank_within_pixels(model.pixel, model.distance)
+    before = np.cumsum(amplitude[order], dtype=np.float64) - amplitude[order]
+    light = np.empty(amplitude.size)
+    light[order] = before - np.maximum.accumulate(np.where(rank == 0, before, 0))
+    fraction = light / np.maximum(light + amplitude, TINY)
+    aside = fraction * PARTLY_FILLED_PX / np.sqrt(model.camera.views)
+    return np.asarray(aside * np.hypot(*model.compute_slopes()))
 
 
 def _judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
