@@ -516,7 +516,7 @@ def test_a_deviation_is_that_of_the_fit_of_further_steps_and_of_the_centres():
         AmplitudeSolver(model, amplitude, 2.0),
         depth(Frames(np.zeros((9, *SHAPE), np.float32), BIN * np.arange(9), CAMERA)),
     )
-    fit = SurfaceFit(solver, refinement, remainder, 0.0, nothing, solver, nothing)
+    fit = SurfaceFit(solver, solver, refinement, remainder, 0.0, nothing, solver, nothing)
     found = list_returns(fit, Detection(), centre_error)
     assert len(found) == model.surface.size
     for surface, (first, slope) in enumerate([(1 / 1.4, 0.02), (1 / 1.7, -0.03)]):

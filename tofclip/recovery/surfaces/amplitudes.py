@@ -20,9 +20,11 @@ NORM_MARGIN = 1.1
 EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
 # Of light beside brighter light of its surface: the sides of the squares whose mean is a place's brightness
-# and in which the brightest counts, the part of that below which a place is dim, and after how many
-# iterations what is dim is looked for anew
+# and in which the brightest counts, the part of that below which a place is dim, after how many
+# iterations what is dim is looked for anew, and by how little, as a logarithm, light may have changed
+# since, on average, to be left as it is; what counts as none, in deviations of a pixel's noise
 PLACE_PX, BESIDE_PX, DIM_PART, REWEIGHT_ITERATIONS = 3, 15, 0.75, 10
+SETTLED_CHANGE, NO_LIGHT_SIGMAS = 0.01, 0.02
 MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 TINY = float(np.finfo(np.float32).tiny)
@@ -112,7 +114,7 @@ class AmplitudeSolver:
         and total variation favours the lens, which is dimmer. `against_dim` is what light costs at places
         that are dark beside the brightest of their surface nearby, in standard deviations as `weight`
         (reweighted l1, E. Candes and others, J. Fourier Anal. Appl. 14, 877, 2008): the lens gives way
-        from its border inwards, and what the shot needs stays.
+        from its border inwards, and what the shot needs stays. It ends early where light hardly changes.
         """
         model = self.model
         steps = 1 / (NORM_MARGIN * self._estimate_norms())
@@ -126,10 +128,15 @@ class AmplitudeSolver:
         )
         weights = self.weight * noise
         step = steps[model.surface].astype(np.float32)
+        deviation, light = np.sqrt(information), None
         ahead, age, cost = self.amplitude, 1.0, np.zeros_like(step)
         for number in range(iterations):
             if against_dim and number % REWEIGHT_ITERATIONS == 0:
-                cost = self._cost_dim(against_dim, np.sqrt(information))
+                before = light
+                light = np.log(np.maximum(self.amplitude * deviation, NO_LIGHT_SIGMAS))
+                if before is not None and np.mean(np.abs(light - before)) < SETTLED_CHANGE:
+                    break
+                cost = self._cost_dim(against_dim, deviation)
             slope = model.pull(ahead, model.image) + cost
             moved = self._shrink(ahead - step * slope, weights * steps)
             if np.sum((ahead - moved) * (moved - self.amplitude)) > 0:

@@ -40,6 +40,9 @@ from tofclip.threads import limit_blas_threads
 START_ITERATIONS = 25
 MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 6, 10
 AGAINST_DIM = 3.0  # until ranges are known; then amplitudes are as the shot has them
+# What dim light costs, in deviations, and for how many iterations at most, where it is to stay only as
+# the shot needs it: first it gives way, then what is needed comes back. Fewer after the first shot.
+SPARSELY, FOLLOWING_SPARSELY = ((4.0, 80), (2.0, 20)), ((4.0, 50), (2.0, 10))
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
 LAST_STEP_SIGMAS = 0.15
 # Where the last shot's fit begins: before and after the ranges' step, and how far beyond the returns
@@ -72,6 +75,7 @@ class SurfaceFit:
     """Surfaces as they were fitted to a shot."""
 
     solver: AmplitudeSolver
+    sparse: AmplitudeSolver  # the same with dim light beside bright only where the shot needs it
     refinement: Refinement  # the last one
     remainder: FloatArray  # (surfaces,), what further steps would still change of ranges, m
     # what the surfaces left unexplained when they were found, as a fraction of the signal
@@ -135,10 +139,14 @@ def _fit_returns(
     # way to them.
     solver, begun = straighten_surfaces(solver)
     refinement, remainder = _refine(solver, begun, tick)
+    # dim light has given way a little by now
+    sparse = AmplitudeSolver(solver.model, solver.amplitude, weight, solver)
+    for sigmas, most in SPARSELY:
+        sparse.run(most, against_dim=sigmas)
     solver.run(iterations, tick)
     reference = solver.model.unexplained(solver.amplitude)
     beside = _find_others(solver, found, tick)
-    return SurfaceFit(solver, refinement, remainder, reference, *beside, found)
+    return SurfaceFit(solver, sparse, refinement, remainder, reference, *beside, found)
 
 
 @limit_blas_threads()
@@ -155,7 +163,9 @@ def follow_surfaces(
     `look`: makes such frames; their returns, and the light of each pixel, (rows, columns).
     """
     model, begun = fit.solver.model.see(streak), replace(fit.refinement, free=None)
-    solver = AmplitudeSolver(model, fit.solver.amplitude, weight, fit.solver)
+    solver, sparse = (
+        AmplitudeSolver(model, one.amplitude, weight, one) for one in (fit.solver, fit.sparse)
+    )
     seen, remainder, limit = fit.seen, fit.remainder, CHANGED_RATIO * fit.reference + CHANGED_EXCESS
     changed = model.unexplained(solver.amplitude) > limit
     if changed:
@@ -190,13 +200,17 @@ def follow_surfaces(
     # what explains the last shot best without the prior has that shot's noise
     refinement = refine_state(model, solver.amplitude, begun, True)
     solver.amplitude = refinement.amplitude
+    if changed:
+        sparse = AmplitudeSolver(model, solver.amplitude, weight, solver)
+    for sigmas, most in FOLLOWING_SPARSELY:
+        sparse.run(most, against_dim=sigmas)
     solver.run(FOLLOWING_ITERATIONS)
     unexplained = model.unexplained(solver.amplitude)
     if unexplained > limit:
         return None
     reference = unexplained if changed else fit.reference
     none = seen[np.zeros(0, np.intp)]
-    return SurfaceFit(solver, refinement, remainder, reference, none, solver, seen)
+    return SurfaceFit(solver, sparse, refinement, remainder, reference, none, solver, seen)
 
 
 def _keep_lit(solver: AmplitudeSolver) -> AmplitudeSolver:

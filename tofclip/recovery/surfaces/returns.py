@@ -12,7 +12,6 @@ from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.lidar import Detection
 from tofclip.lidar.range_calibration import correct_returns
-from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.fit import SURE_SIGMAS, SurfaceFit, find_candidates, find_near
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.patches import rank_within_pixels
@@ -27,9 +26,7 @@ from tofclip.units import SPEED_OF_LIGHT
 # significance where dim light beside bright is costly, and where the frames have returns beside all
 # points about it. From scenes of known returns (tests/lidar/physics_scenes.py); docs tell what they miss.
 FALSE_ODDS = np.array([0.72, -0.78, -4.63])
-# What such light costs, in deviations, and for how many iterations: first it gives way, then what the
-# shot needs comes back. A significance of less than the last counts as that.
-JUDGED_AGAINST_DIM, LEAST_SIGMAS = ((4.0, 100), (2.0, 20)), 0.1
+LEAST_SIGMAS = 0.1  # a significance of less counts as that
 ABOUT_PX = 5  # side of the square
 
 # Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
@@ -117,15 +114,10 @@ def estimate_hidden_shift(model: SurfaceModel, amplitude: Image) -> FloatArray:
 
 
 def _judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
-    """Numbers of the candidates among the points, and how probable it is that each is false: the shot is
-    explained once more with dim light only where it needs it.
-    """
+    """Numbers of the candidates among the points, and how probable it is that each is false."""
     solver, model, seen = fit.solver, fit.solver.model, fit.seen
     shown, _ = find_candidates(solver, limit)
-    sparse = AmplitudeSolver(model, solver.amplitude, solver.weight, solver)
-    for sigmas, iterations in JUDGED_AGAINST_DIM:
-        sparse.run(iterations, against_dim=sigmas)
-    significance = sparse.measure_significance(solver.estimate_local_variance())[shown]
+    significance = fit.sparse.measure_significance(solver.estimate_local_variance())[shown]
     points = model.row[shown], model.column[shown], model.distance[shown]
     candidates, confirmed = shown.astype(np.float64), np.zeros(shown.size)
     confirmed[shown] = find_near(points, (seen.y, seen.x, seen.range), model.row_m)
