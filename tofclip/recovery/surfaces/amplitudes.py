@@ -231,12 +231,14 @@ def scale_amplitude(model: SurfaceModel, lit: NDArray[np.bool_]) -> Image:
     return np.where(lit & (diagonal > 0), scale, 0).astype(np.float32)
 
 
-def explain_by_amplitude(model: SurfaceModel, image: Image, scale: Image, iterations: int) -> Image:
+def explain_by_amplitude(
+    model: SurfaceModel, image: Image, start: Image, scale: Image, iterations: int
+) -> Image:
     """Return the change of amplitude x that lowers ``|image - A x|_w`` most, by conjugate gradients
-    in the scale of `scale_amplitude`.
+    in the scale of `scale_amplitude` from one to start at.
     """
-    change = np.zeros_like(scale)
-    residual = scale * model.gather(model.weights * image)
+    change = start.copy()
+    residual = -scale * model.pull(change, image)
     direction, energy = residual.copy(), float(np.sum(residual**2, dtype=np.float64))
     for _ in range(iterations):
         if energy == 0:

@@ -61,35 +61,37 @@ def split_over_slit(position, width, height, tangent, first, shares):
 
 
 @fast_loop
-def add_light(amplitude, point, share, row, row_shares, column, slit_shares, above, before, image):
-    """Add the light of surface points to the image of a view; all of it must fall inside. `point, share`
-    (places,): of which point each place has which part; `row, column`: first of those that a place
-    reaches, shares there (places, 3) and (places, 4); `above, before`: the image's first ones.
+def add_light(amplitude, starts, row, row_shares, column, slit_shares, above, before, image):
+    """Add the light of surface points, even over their places, to the image of a view; all of it must
+    fall inside. `starts` (points + 1,): first place of each; `row, column` (places,): first of those that
+    a place reaches, shares there (places, 3) and (places, 4); `above, before`: the image's first ones.
     """
-    for place in range(point.size):
+    for point in range(amplitude.size):
         # most points of a volume are dark
-        light = amplitude[point[place] - point[0]] * share[place]
-        if light == 0:
+        if amplitude[point] == 0:
             continue
-        top, left = row[place] - above, column[place] - before
-        for i in range(3):
-            instant = light * row_shares[place, i]
-            for j in range(4):
-                image[top + i, left + j] += instant * slit_shares[place, j]
+        light = amplitude[point] / (starts[point + 1] - starts[point])
+        for place in range(starts[point], starts[point + 1]):
+            top, left = row[place] - above, column[place] - before
+            for i in range(3):
+                instant = light * row_shares[place, i]
+                for j in range(4):
+                    image[top + i, left + j] += instant * slit_shares[place, j]
 
 
 @fast_loop
-def gather_light(image, gain, point, share, row, row_shares, column, slit_shares, above, amplitude):
+def gather_light(image, gain, starts, row, row_shares, column, slit_shares, above, amplitude):
     """The adjoint of `add_light`: what each point's light would find in an image of all columns."""
-    for place in range(point.size):
-        top, left = row[place] - above, column[place]
-        total = 0.0
-        for i in range(3):
-            instant = 0.0
-            for j in range(4):
-                instant += slit_shares[place, j] * image[top + i, left + j]
-            total += row_shares[place, i] * instant
-        amplitude[point[place]] += gain * share[place] * total
+    for point in range(amplitude.size):
+        total = np.float32(0)
+        for place in range(starts[point], starts[point + 1]):
+            top, left = row[place] - above, column[place]
+            for i in range(3):
+                instant = np.float32(0)
+                for j in range(4):
+                    instant += slit_shares[place, j] * image[top + i, left + j]
+                total += row_shares[place, i] * instant
+        amplitude[point] = gain * total / (starts[point + 1] - starts[point])
 
 
 @fast_loop

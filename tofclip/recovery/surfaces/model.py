@@ -163,7 +163,6 @@ class Places(NamedTuple):
     offset: FloatArray  # (2, places), from the pixel's middle along columns and rows, px
     size: FloatArray  # (2, places), along columns and rows, px
     distance: FloatArray  # (places,), m
-    share: Image  # (places,), of the point's light
     # (points,), sum of squares of what parts have in common, over that of the pulse alone
     overlap: Image
 
@@ -182,13 +181,7 @@ class Places(NamedTuple):
         away = np.sum(offset * slopes[:, point], axis=0)
         ramp = np.hypot(*slopes) / row_m / pulse_rows  # pulses that a pixel spans
         overlap = (1 / np.sqrt(1 + ramp**2 / 6)).astype(np.float32)
-        share = (1 / total[point]).astype(np.float32)
-        return cls(point, starts, offset, size, distance[point] + away, share, overlap)
-
-    def find(self, part: slice) -> slice:
-        """Those of some points."""
-        first, last, _ = part.indices(self.starts.size - 1)
-        return slice(int(self.starts[first]), int(self.starts[last]))
+        return cls(point, starts, offset, size, distance[point] + away, overlap)
 
 
 class Footprint(NamedTuple):
@@ -510,9 +503,8 @@ class SurfaceModel:
         """Return what the streak image receives of some points by a view of gain 1. `amplitude`: of
         the points in `part`; `kernel` (taps,): of the pulse's core.
         """
-        top, image = self._project(view, amplitude, kernel, part)
-        own, slit = self._cut_to_slit(view, part, image.shape[1])
-        light, first = image[:, own], max(top - self.before + int(self.pulse.lags.min()), 0)
+        top, slit, light = self._project(view, amplitude, kernel, part)
+        first = max(top - self.before + int(self.pulse.lags.min()), 0)
         last = top + len(light) - self.before + int(self.pulse.lags.max())
         last = max(min(last, self.image.shape[0]), first)
         return Window(
@@ -521,41 +513,40 @@ class SurfaceModel:
 
     def _project(
         self, view: int, amplitude: Image, kernel: Image, part: slice
-    ) -> tuple[int, Image]:
+    ) -> tuple[int, slice, Image]:
         """What a view of gain 1 sees of some points without their afterglow: the first row, as rows of
-        `Footprint` count, and (rows, columns) there.
+        `Footprint` count, the columns of the slit, and (rows, columns) there.
         """
         from tofclip.recovery.surfaces.kernels import add_light, smooth_rows
 
         place, margin, samples = self.footprints[view], self._margin, 3
         amplitude, lit = self.shade(view, amplitude, part), place.lit_rows
-        first, last = self._lit_before.start, self._lit_before.stop
-        left, right = 0, place.columns
-        own = self.places.find(part)
-        row, column = place.row[own], place.column[own]
-        if not (row.size and lit.size):
-            return 0, np.zeros((0, 0), np.float32)
+        if not (amplitude.size and lit.size):
+            return 0, slice(0, 0), np.zeros((0, 0), np.float32)
+        first, last, left, right = int(lit[0]), int(lit[-1]) + 1, 0, place.columns
+        begin, end, _ = part.indices(self.surface.size)
+        starts = self.places.starts[begin : end + 1]
         if part != slice(None):
+            own = slice(int(starts[0]), int(starts[-1]))
+            row, column = place.row[own], place.column[own]
             first = max(int(row.min()) - self.half, 0)
             last = max(min(int(row.max()) + samples + self.half, self._rows), first)
             left, right = int(column.min()), int(column.max()) + SLIT_PIXELS
             lit = np.arange(first, last)
         light = np.zeros((last - first + 2 * margin, right - left), np.float32)
-        parts = self.places.point[own], self.places.share[own]
-        down, across = (row, place.row_shares[own]), (column, place.slit_shares[own])
-        add_light(amplitude, *parts, *down, *across, first - margin, left, light)
+        spread = place.row, place.row_shares, place.column, place.slit_shares
+        add_light(amplitude, starts, *spread, first - margin, left, light)
         image = np.zeros((last - first, light.shape[1]), np.float32)
         smooth_rows(light, kernel, np.arange(-self.half, self.half + 1), lit - first, margin, image)
-        return first, image
+        seen, slit = self._cut_to_slit(view, left, right)
+        return first, slit, image[:, seen]
 
-    def _cut_to_slit(self, view: int, part: slice, width: int) -> tuple[slice, slice]:
-        """The part of some points' columns that lies on the slit, and where."""
-        place = self.footprints[view]
-        own = place.column[self.places.find(part)]
-        first = place.first_column + int(own.min(initial=place.columns))
-        left = min(max(first, 0), self.image.shape[1])
-        right = max(left, min(first + width, self.image.shape[1]))
-        return slice(left - first, right - first), slice(left, right)
+    def _cut_to_slit(self, view: int, left: int, right: int) -> tuple[slice, slice]:
+        """Which of some columns of a view lie on the slit, and where."""
+        first, width = self.footprints[view].first_column + left, self.image.shape[1]
+        start = min(max(first, 0), width)
+        stop = max(start, min(first + right - left, width))
+        return slice(start - first, stop - first), slice(start, stop)
 
     def _trail(self, light: Image, first: int, rows: int) -> Image:
         """Some rows of light with its afterglow, from row `first` of `light` on."""
@@ -586,9 +577,8 @@ class SurfaceModel:
         seen = self.map_parallel(
             lambda view: self._project(view, amplitude, kernels[view], everywhere), len(kernels)
         )
-        for view, (top, light) in enumerate(seen):
-            own, slit = self._cut_to_slit(view, everywhere, light.shape[1])
-            total[top - above : top - above + len(light), slit] += light[:, own]
+        for top, slit, light in seen:
+            total[top - above : top - above + len(light), slit] += light
         rows = self._lit.stop - self._lit.start
         return self._trail(total, self._lit.start + self.before - above, rows)
 
@@ -598,8 +588,9 @@ class SurfaceModel:
         """
         rest = self._render_lit(amplitude)
         if image is not None:
-            rest = rest - image[self._lit]
-        return self._gather_lit(self.weights[self._lit] * rest)
+            rest -= image[self._lit]
+        rest *= self.weights[self._lit]
+        return self._gather_lit(rest)
 
     def gather(self, image: Image, squared: bool = False) -> Image:
         """Return A' of an image, (points,); squared: with the squares of all entries."""
@@ -636,14 +627,20 @@ class SurfaceModel:
             if squared:  # a pulse is smooth: the square of its samples between rows is theirs
                 whole = self.pulse.extend(self.make_kernel(view, variance=0.0))
                 kernel, gain, slit_shares = whole**2, gain**2, slit_shares**2
-            own, slit = self._cut_to_slit(view, slice(None), place.columns)
-            part = np.zeros((len(seen), place.columns), np.float32)
-            part[:, own] = seen[:, slit]
+            own, slit = self._cut_to_slit(view, 0, place.columns)
+            first = max(int(place.lit_rows.min(initial=0) + self.pulse.lags.min()) - above, 0)
+            last = max(
+                int(place.lit_rows.max(initial=0) + self.pulse.lags.max()) + 1 - above, first
+            )
+            lit = seen[first:last, slit]
+            part = np.zeros((len(lit), place.columns), np.float32)
+            part[:, own] = lit
             smooth = np.empty((self._rows + 2 * self._margin, place.columns), np.float32)
-            smooth_rows(part, kernel, -lags, place.reached_rows, -self._margin - above, smooth)
-            found, parts = np.zeros(self.surface.size, np.float32), self.places
-            light = parts.point, parts.share, place.row, place.row_shares, place.column, slit_shares
-            gather_light(smooth, gain, *light, -self._margin, found)
+            begin = -self._margin - above - first
+            smooth_rows(part, kernel, -lags, place.reached_rows, begin, smooth)
+            found = np.empty(self.surface.size, np.float32)
+            light = place.row, place.row_shares, place.column, slit_shares
+            gather_light(smooth, gain, self.places.starts, *light, -self._margin, found)
             if squared:
                 found *= self.places.overlap
             found = self.shade(view, found)

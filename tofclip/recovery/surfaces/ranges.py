@@ -451,10 +451,8 @@ def _explain_rest(
     model: SurfaceModel, error: Image, change: Image, scale: Image, iterations: int
 ) -> tuple[Image, Image]:
     """The change of amplitude that explains a misfit best, begun at `change`, and what is left."""
-    if change.any():
-        error = error - model.render(change)
-    further = explain_by_amplitude(model, error, scale, iterations)
-    return change + further, error - model.render(further)
+    change = explain_by_amplitude(model, error, change, scale, iterations)
+    return change, error - model.render(change)
 
 
 def measure_local_shifts(model: SurfaceModel, amplitude: Image, rest: Image) -> FloatArray:
@@ -540,7 +538,8 @@ def _eliminate_amplitude(
     if start is not None:
         changes[:, scale > 0] = start[:, scale > 0]
         iterations = FURTHER_ELIMINATION_ITERATIONS
-    for number, change in enumerate(changes):
+    most = max(functions.shape[1] for functions, _ in shares)
+    for number, change in enumerate(changes[:most]):
         image = np.zeros_like(model.image)
         for group in own:
             functions, _ = shares[group.names[0][1]]
@@ -548,9 +547,7 @@ def _eliminate_amplitude(
                 image[group.area] += np.tensordot(
                     functions[:, number].astype(np.float32), group.images, 1
                 )
-        if change.any():
-            image -= model.render(change)
-        change += explain_by_amplitude(model, image, scale, iterations)
+        change[:] = explain_by_amplitude(model, image, change, scale, iterations)
         if start is None and number == 0:
             # a smooth multiple of a derivative takes nearly that multiple of its change
             for surface, (functions, _) in enumerate(shares):
