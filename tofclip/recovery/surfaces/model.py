@@ -53,7 +53,7 @@ PART_ROWS, MAX_PARTS = 1.5, 6
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
 SWEEP_LEFT_FRACTION = (
-    0.1  # of the corrections to a sweep, which are lines: what is left of its shape
+    0.15  # of the corrections to a sweep, which are lines: what is left of its shape
 )
 PARALLEL_POINTS = 20_000  # threads take as long to begin as so many need
 MIN_BEHIND_PX = 100  # of a surface, seen through another; fewer are a rim, of which each has a part
