@@ -29,7 +29,7 @@ def recover(scene, photons):
     [
         ("wires", 0.03, 0.06, 2.0, 0.13),
         pytest.param("room", 0.05, 0.01, 1.9, 0.33, marks=pytest.mark.nightly),
-        pytest.param("table", 0.08, 0.01, 2.7, 0.2, marks=pytest.mark.nightly),
+        pytest.param("table", 0.08, 0.01, 2.7, 0.3, marks=pytest.mark.nightly),
     ],
 )
 def test_dim_and_small_things_are_seen_beside_bright_ones(
@@ -53,7 +53,7 @@ def test_dim_and_small_things_are_seen_beside_bright_ones(
     # no return of the frames is where a surface has its own
     near = (np.diff(pixel) == 0) & (np.diff(returns.range) < 0.02)
     assert near.mean() < 0.02
-    # each surface is about as far off as it says: 0.67 to 0.94 in the room, whose balls had 0.15; twice
+    # each surface is about as far off as it says: 0.35 to 1.6 in the room, whose balls had 0.15; twice
     # of what seed 2 has and half of it, but 2.60 of an apple that is 10 px wide
     assert too_large < min(score["z"].values()), score["z"]
     assert max(score["z"].values()) < too_small, score["z"]
