@@ -113,9 +113,8 @@ def photons(
     Pulse, background and how far neighbours help each other are found from the photons. Hot pixels
     are left out, counted, and marked in a range image (hot_pixels). Of several --returns a range
     image holds the strongest in range_m and all of them in returns_range_m (rows, columns, returns),
-    NaN where there is none; likewise range_sigma_m, intensity and outlier_probability. Where nothing
-    sends light back the neighbours' surface goes on: intensity is low there, the probability need not
-    be high.
+    NaN where there is none; likewise range_sigma_m, intensity and outlier_probability, that of a wrong
+    range or of a pixel that sends no light back: the neighbours' surface goes on there.
 
     Example: tofclip lidar photons cube.npy --bin-width-ps 80 --pulse-ps 400 --out range.npz
     """

@@ -66,6 +66,23 @@ def test_deviations_and_outliers_are_as_stated(signal, background, least):
     assert abs(offset) < 2 * float(found.settings["response_sigma_m"])
 
 
+@pytest.mark.parametrize("background", [0.02, 0.2])
+def test_where_no_light_comes_back_the_surface_beside_is_doubted(background):
+    """Of a plate before nothing 99 % of the empty pixels, and then a tenth of all that were kept, had
+    their neighbours' surface, sure of it. Of the plate, what lies at its border may be doubted.
+    """
+    plate = np.zeros((48, 64), bool)
+    plate[10:40, 10:50] = True
+    rates = np.full((*plate.shape, 200), background)
+    rates[plate, 99:102] += 3
+    found = estimate(rates, 1, Pulse.gaussian(5 * scenes.BIN), True)
+    kept = found.outlier_probability < 0.1
+    border = 2 * (30 + 40)
+    assert np.sum(~kept & plate) < border / 2
+    assert np.sum(kept & ~plate) < border / 10
+    assert np.mean(found.outlier_probability[~plate] > 0.3) > 0.9
+
+
 @pytest.mark.parametrize("shape", [(1, 256), (64, 64)])
 @pytest.mark.parametrize("pulse", [(), (GIVEN, False)])
 def test_many_photons_place_the_surface_far_below_a_bin(shape, pulse):

@@ -508,8 +508,8 @@ class SurfaceImage:
     intensity : (rows, columns) float64 array
         Expected photons of the return.
     outlier_probability : (rows, columns) float64 array
-        That the return is not of this pixel's surface, if it has one: where nothing sends light back
-        the neighbours' surface goes on, and only `intensity` is low.
+        That the return is not of this pixel's surface, or that it has none: where nothing sends light
+        back the neighbours' surface goes on.
     pulse : Pulse
         The response that was used, as bins show it.
     settings : mapping

@@ -63,6 +63,9 @@ MARGIN_WEIGHT, MARGIN_WEIGHT_SPREAD = 1 / 7, 0.5
 # 2.4 in the same scenes), many where no light comes back.
 RIVAL_SPREAD = 0.5
 MARGIN_WEIGHTS, RIVALS = np.geomspace(0.03, 0.8, 24), np.geomspace(0.5, 256, 10)
+# Of pixels that send no light back: sides of the squares whose photons count, and whose background.
+EMPTY_POOL_PX, EMPTY_BACKGROUND_PX, EMPTY_ROUNDS = 3, 9, 30
+TINY = 1e-9
 MAX_JUDGED_PIXELS = 20_000  # evenly chosen, that the outlier probability is learnt from
 SLOPE_COSTS = (0.5, 2.0, 10.0)  # log-likelihood that a change by one label has to bring
 JUMP_COST_RATIO = 9.0  # any larger change costs this many times as much
@@ -168,6 +171,7 @@ def estimate_surface(
             return estimate_surface(even, pulse, learn, max_returns, seed, progress)
     reach, fitted = choose_reach(train, test, training, surface)
     to_probability = calibrate_outliers(test, train, training, fitted, margin)
+    empty = estimate_emptiness(test, train, training, fitted[..., 0])
     report(0.8)
 
     def locate(photons: PhotonImage) -> FloatArray:
@@ -189,6 +193,7 @@ def estimate_surface(
         return np.stack([fitted[..., 0], sigma, fitted[..., 2], to_probability(margin)], -1)
 
     layers, rest = [locate(photons)], photons
+    layers[0][..., 3] += (1 - layers[0][..., 3]) * empty
     # A surface goes on where another one stops: behind an edge the second of a pixel may be found
     # only when the third of the picture is looked for.
     for _ in range(max_returns if max_returns > 1 else 0):
@@ -344,6 +349,64 @@ def calibrate_outliers(
 
     weight, rivals = max(itertools.product(MARGIN_WEIGHTS, RIVALS), key=weigh)
     return lambda value: doubt(value, weight, rivals)
+
+
+def estimate_emptiness(
+    test: PhotonImage, train: PhotonImage, scene: Scene, surface: FloatArray
+) -> FloatArray:
+    """Return how probable it is that a pixel sends no light back, (rows, columns), where its neighbours'
+    surface, in bins, goes on: photons held back, which had no part in it, are the background's then.
+    Those of the neighbours count as well. How bright surfaces are and how many pixels are empty is
+    what explains all pixels best.
+    """
+    response, side = scene.response, EMPTY_POOL_PX
+    times = response.start + response.step * np.arange(response.density.size)
+    # a response's tail holds little light and much background
+    bright = times[response.density >= response.density.max() / 2]
+    length = float(bright[-1] - bright[0]) + max(response.step, 1.0)
+
+    def count(photons: PhotonImage) -> FloatArray:
+        late = photons.times_after(surface) - (bright[0] + bright[-1]) / 2
+        return photons.sum_by_pixel(photons.count * (np.abs(late) <= length / 2))
+
+    def add_up(values: FloatArray, side: int = side) -> FloatArray:
+        mean = scipy.ndimage.uniform_filter(values.astype(np.float64), side, mode="nearest")
+        return np.asarray(side**2 * mean)
+
+    late = train.times_after(surface)
+    far = (late < response.start) | (late > response.width - response.start)
+    even = add_up(train.sum_by_pixel(train.count * far / train.relative), EMPTY_BACKGROUND_PX)
+    even *= length / max(train.bins - response.width + 2 * response.start, 1)
+    even *= train.relative_at(surface) / (EMPTY_BACKGROUND_PX**2 * (1 - HELD_OUT_FRACTION))
+    held_back = count(test)
+    seen, expected = np.rint(add_up(held_back)), HELD_OUT_FRACTION * add_up(even)
+    share, empty = 0.5, np.full(surface.shape, 0.5)
+    for _ in range(EMPTY_ROUNDS):
+        light = max(float(np.average(seen - expected, weights=1 - empty)), TINY)
+        empty = scipy.special.expit(
+            scipy.special.logit(share) - compare_with_background(seen, expected, light)
+        )
+        share = float(np.clip(empty.mean(), TINY, 1 - TINY))
+    # what has empty pixels beside it may have its photons from the others beside it
+    own = held_back + count(train)
+    others = (add_up(own - even) - (own - even)) / (side**2 - 1)
+    alone = scipy.special.expit(-compare_with_background(own, even, np.maximum(others, TINY)))
+    beside = scipy.ndimage.maximum_filter(empty, side, mode="nearest") > 0.5
+    return np.asarray(np.where(beside, np.maximum(empty, alone), empty))
+
+
+def compare_with_background(
+    seen: FloatArray, expected: FloatArray, light: float | FloatArray
+) -> FloatArray:
+    """Log-likelihood ratio of photons that are seen: of a surface, whose light is exponentially
+    distributed with the mean `light`, against the background alone, of which so many are expected.
+    """
+    expected, rate = np.maximum(expected, TINY), 1 + 1 / light
+    beyond = scipy.special.gammaincc(seen + 1, expected * rate)
+    lit = np.log(np.maximum(beyond, TINY)) + expected / light - np.log(light)
+    lit -= (seen + 1) * np.log(rate)
+    alone = scipy.special.xlogy(seen, expected) - expected - scipy.special.gammaln(seen + 1)
+    return np.asarray(lit - alone)
 
 
 def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> PhotonImage:
