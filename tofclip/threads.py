@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import copy_context
 from functools import lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
@@ -93,7 +94,8 @@ def map_parallel(
     with open_worker_pool(threads) as pool:
         pending: deque[Future[Result]] = deque()
         for job in jobs:
-            pending.append(pool.submit(work, job))
+            # in the caller's context: NumPy keeps there which faults are ignored
+            pending.append(pool.submit(copy_context().run, work, job))
             if len(pending) > (lookahead or threads):
                 yield pending.popleft().result()
         while pending:

@@ -80,18 +80,20 @@ def add_light(amplitude, starts, row, row_shares, column, slit_shares, above, be
 
 
 @fast_loop
-def gather_light(image, gain, starts, row, row_shares, column, slit_shares, above, amplitude):
-    """The adjoint of `add_light`: what each point's light would find in an image of all columns."""
-    for point in range(amplitude.size):
-        total = np.float32(0)
-        for place in range(starts[point], starts[point + 1]):
-            top, left = row[place] - above, column[place]
-            for i in range(3):
-                instant = np.float32(0)
-                for j in range(4):
-                    instant += slit_shares[place, j] * image[top + i, left + j]
-                total += row_shares[place, i] * instant
-        amplitude[point] = gain * total / (starts[point + 1] - starts[point])
+def gather_light(image, gain, point, row, row_shares, column, slit_shares, above, amplitude):
+    """The adjoint of `add_light`, but for the points' shares: what places would find in an image of all
+    columns is added up for the `point` (places,) of each. A loop over points, each with its places,
+    takes half as long again.
+    """
+    for place in range(point.size):
+        top, left = row[place] - above, column[place]
+        total = 0.0
+        for i in range(3):
+            instant = 0.0
+            for j in range(4):
+                instant += slit_shares[place, j] * image[top + i, left + j]
+            total += row_shares[place, i] * instant
+        amplitude[point[place]] += gain * total
 
 
 @fast_loop

@@ -163,6 +163,7 @@ class Places(NamedTuple):
     offset: FloatArray  # (2, places), from the pixel's middle along columns and rows, px
     size: FloatArray  # (2, places), along columns and rows, px
     distance: FloatArray  # (places,), m
+    share: Image  # (points,), of a point's light that each of its places has
     # (points,), sum of squares of what parts have in common, over that of the pulse alone
     overlap: Image
 
@@ -181,7 +182,8 @@ class Places(NamedTuple):
         away = np.sum(offset * slopes[:, point], axis=0)
         ramp = np.hypot(*slopes) / row_m / pulse_rows  # pulses that a pixel spans
         overlap = (1 / np.sqrt(1 + ramp**2 / 6)).astype(np.float32)
-        return cls(point, starts, offset, size, distance[point] + away, overlap)
+        share = (1 / total).astype(np.float32)
+        return cls(point, starts, offset, size, distance[point] + away, share, overlap)
 
 
 class Footprint(NamedTuple):
@@ -638,9 +640,10 @@ class SurfaceModel:
             smooth = np.empty((self._rows + 2 * self._margin, place.columns), np.float32)
             begin = -self._margin - above - first
             smooth_rows(part, kernel, -lags, place.reached_rows, begin, smooth)
-            found = np.empty(self.surface.size, np.float32)
+            found = np.zeros(self.surface.size, np.float32)
             light = place.row, place.row_shares, place.column, slit_shares
-            gather_light(smooth, gain, self.places.starts, *light, -self._margin, found)
+            gather_light(smooth, gain, self.places.point, *light, -self._margin, found)
+            found *= self.places.share
             if squared:
                 found *= self.places.overlap
             found = self.shade(view, found)
