@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.lidar import Detection, compute_ray_directions, depth
+from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
 from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver, Tick
 from tofclip.recovery.surfaces.patches import find_dimmer_patches, rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
@@ -82,7 +83,7 @@ class SurfaceFit:
     reference: float
     # of the frames, where the shot shows light that no surface explains; ranges as measured
     others: Returns
-    whole: AmplitudeSolver  # with the light of these
+    whole: AmplitudeSolver  # with the light of those that are kept
     seen: Returns  # of the frames, all
 
 
@@ -322,8 +323,9 @@ def _find_others(
     known = [np.ones(shown.size), shown, scipy.special.logit(doubt)]
     doubt = scipy.special.expit(OTHER_ODDS @ np.array(known)).astype(np.float32)
     others = replace(others, false_alarm=doubt)[doubt < 0.5]
-    # light of those that are left out goes to the others
-    return others, _add_returns(solver, others, tick)[0]
+    # light of those that are dropped as all methods drop them goes to the others
+    kept = others[others.false_alarm <= DEFAULT_FALSE_ALARM]
+    return others, _add_returns(solver, kept, tick)[0]
 
 
 def _add_returns(
