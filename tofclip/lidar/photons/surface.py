@@ -250,12 +250,11 @@ def weigh_evidence(
     response, late = scene.response, train.times_after(surface)
     inside = (late >= response.start) & (late <= response.width - response.start)
     length = response.width - 2 * response.start
-    seen, total, even = (
+    seen, total = (
         scipy.ndimage.uniform_filter(train.sum_by_pixel(part), signal_pool, mode="nearest")
-        for part in (train.count * inside, train.count, train.count * ~inside / train.relative)
+        for part in (train.count * inside, train.count)
     )
-    # Background within the response's length, as dense as outside of it where it is as bright.
-    outside = even * train.relative_at(surface) * length / max(train.bins - length, 1)
+    outside = length * estimate_background(train, surface, inside, length, signal_pool)
     # That all is signal is never claimed: one photon against it would decide for the pixel. More
     # than there is would count against every surface in a hundred times as much background.
     signal = np.clip((seen - outside) / np.maximum(total, 1e-9), MIN_SIGNAL_SHARE, 0.98)
@@ -266,6 +265,18 @@ def weigh_evidence(
     sampled = response.density * train.bins, response.start, response.step, signal.ravel()
     kernels.sum_evidence(test.offsets, test.bin, test.count, course, flat, *sampled, evidence)
     return evidence
+
+
+def estimate_background(
+    photons: PhotonImage, surface: FloatArray, inside: BoolArray, length: float, side: int
+) -> FloatArray:
+    """Return the background's photons a bin at each pixel's surface, (rows, columns): as dense as outside
+    of a response, `length` bins long, where it is as bright, in a square of so many pixels a side.
+    `inside`: which events lie on a surface.
+    """
+    outside = photons.sum_by_pixel(photons.count * ~inside / photons.relative)
+    even = scipy.ndimage.uniform_filter(outside, side, mode="nearest")
+    return np.asarray(even * photons.relative_at(surface) / max(photons.bins - length, 1))
 
 
 def learn_scene(
@@ -363,21 +374,21 @@ def estimate_emptiness(
     times = response.start + response.step * np.arange(response.density.size)
     # a response's tail holds little light and much background
     bright = times[response.density >= response.density.max() / 2]
-    length = float(bright[-1] - bright[0]) + max(response.step, 1.0)
+    short = float(bright[-1] - bright[0]) + max(response.step, 1.0)
+    length = response.width - 2 * response.start
 
     def count(photons: PhotonImage) -> FloatArray:
         late = photons.times_after(surface) - (bright[0] + bright[-1]) / 2
-        return photons.sum_by_pixel(photons.count * (np.abs(late) <= length / 2))
+        return photons.sum_by_pixel(photons.count * (np.abs(late) <= short / 2))
 
-    def add_up(values: FloatArray, side: int = side) -> FloatArray:
+    def add_up(values: FloatArray) -> FloatArray:
         mean = scipy.ndimage.uniform_filter(values.astype(np.float64), side, mode="nearest")
         return np.asarray(side**2 * mean)
 
     late = train.times_after(surface)
-    far = (late < response.start) | (late > response.width - response.start)
-    even = add_up(train.sum_by_pixel(train.count * far / train.relative), EMPTY_BACKGROUND_PX)
-    even *= length / max(train.bins - response.width + 2 * response.start, 1)
-    even *= train.relative_at(surface) / (EMPTY_BACKGROUND_PX**2 * (1 - HELD_OUT_FRACTION))
+    inside = (late >= response.start) & (late <= response.width - response.start)
+    even = estimate_background(train, surface, inside, length, EMPTY_BACKGROUND_PX)
+    even *= short / (1 - HELD_OUT_FRACTION)
     held_back = count(test)
     seen, expected = np.rint(add_up(held_back)), HELD_OUT_FRACTION * add_up(even)
     share, empty = 0.5, np.full(surface.shape, 0.5)

@@ -5,7 +5,7 @@ of the shot before, are taken, their amplitudes and ranges fitted, and the frame
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -19,6 +19,7 @@ from tofclip.errors import InputError
 from tofclip.lidar import Detection, compute_ray_directions, depth
 from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
 from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver, Tick
+from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.patches import find_dimmer_patches, rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
 from tofclip.recovery.surfaces.ranges import Refinement, refine_state
@@ -141,9 +142,7 @@ def _fit_returns(
     solver, begun = straighten_surfaces(solver)
     refinement, remainder = _refine(solver, begun, tick)
     # dim light has given way a little by now
-    sparse = AmplitudeSolver(solver.model, solver.amplitude, weight, solver)
-    for sigmas, most in SPARSELY:
-        sparse.run(most, against_dim=sigmas)
+    sparse = _explain_sparsely(solver.model, solver, SPARSELY)
     solver.run(iterations, tick)
     reference = solver.model.unexplained(solver.amplitude)
     beside = _find_others(solver, found, tick)
@@ -164,9 +163,7 @@ def follow_surfaces(
     `look`: makes such frames; their returns, and the light of each pixel, (rows, columns).
     """
     model, begun = fit.solver.model.see(streak), replace(fit.refinement, free=None)
-    solver, sparse = (
-        AmplitudeSolver(model, one.amplitude, weight, one) for one in (fit.solver, fit.sparse)
-    )
+    solver = AmplitudeSolver(model, fit.solver.amplitude, weight, fit.solver)
     seen, remainder, limit = fit.seen, fit.remainder, CHANGED_RATIO * fit.reference + CHANGED_EXCESS
     changed = model.unexplained(solver.amplitude) > limit
     if changed:
@@ -201,10 +198,7 @@ def follow_surfaces(
     # what explains the last shot best without the prior has that shot's noise
     refinement = refine_state(model, solver.amplitude, begun, True)
     solver.amplitude = refinement.amplitude
-    if changed:
-        sparse = AmplitudeSolver(model, solver.amplitude, weight, solver)
-    for sigmas, most in FOLLOWING_SPARSELY:
-        sparse.run(most, against_dim=sigmas)
+    sparse = _explain_sparsely(model, solver if changed else fit.sparse, FOLLOWING_SPARSELY)
     solver.run(FOLLOWING_ITERATIONS)
     unexplained = model.unexplained(solver.amplitude)
     if unexplained > limit:
@@ -212,6 +206,18 @@ def follow_surfaces(
     reference = unexplained if changed else fit.reference
     none = seen[np.zeros(0, np.intp)]
     return SurfaceFit(solver, sparse, refinement, remainder, reference, none, solver, seen)
+
+
+def _explain_sparsely(
+    model: SurfaceModel, begun: AmplitudeSolver, schedule: Sequence[tuple[float, int]]
+) -> AmplitudeSolver:
+    """Explain a shot with dim light beside bright only where it needs it, from amplitudes of the same
+    surfaces; `schedule`: what such light costs, and for how many iterations at most.
+    """
+    sparse = AmplitudeSolver(model, begun.amplitude, begun.weight, begun)
+    for sigmas, most in schedule:
+        sparse.run(most, against_dim=sigmas)
+    return sparse
 
 
 def _keep_lit(solver: AmplitudeSolver) -> AmplitudeSolver:

@@ -61,20 +61,20 @@ def split_over_slit(position, width, height, tangent, first, shares):
 
 
 @fast_loop
-def add_light(amplitude, starts, row, row_shares, column, slit_shares, above, before, image):
-    """Add the light of surface points, even over their places, to the image of a view; all of it must
-    fall inside. `starts` (points + 1,): first place of each; `row, column` (places,): first of those that
-    a place reaches, shares there (places, 3) and (places, 4); `above, before`: the image's first ones.
+def add_light(light, starts, row, row_shares, column, slit_shares, above, before, image):
+    """Add the light of surface points, so much from each of a point's places, to the image of a view; all
+    of it must fall inside. `starts` (points + 1,): first place of each; `row, column` (places,): first of
+    those that a place reaches, shares there (places, 3) and (places, 4); `above, before`: the image's
+    first ones.
     """
-    for point in range(amplitude.size):
+    for point in range(light.size):
         # most points of a volume are dark
-        if amplitude[point] == 0:
+        if light[point] == 0:
             continue
-        light = amplitude[point] / (starts[point + 1] - starts[point])
         for place in range(starts[point], starts[point + 1]):
             top, left = row[place] - above, column[place] - before
             for i in range(3):
-                instant = light * row_shares[place, i]
+                instant = light[point] * row_shares[place, i]
                 for j in range(4):
                     image[top + i, left + j] += instant * slit_shares[place, j]
 

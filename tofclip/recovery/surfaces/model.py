@@ -537,7 +537,8 @@ class SurfaceModel:
             lit = np.arange(first, last)
         light = np.zeros((last - first + 2 * margin, right - left), np.float32)
         spread = place.row, place.row_shares, place.column, place.slit_shares
-        add_light(amplitude, starts, *spread, first - margin, left, light)
+        shared = amplitude * self.places.share[part]
+        add_light(shared, starts, *spread, first - margin, left, light)
         image = np.zeros((last - first, light.shape[1]), np.float32)
         smooth_rows(light, kernel, np.arange(-self.half, self.half + 1), lit - first, margin, image)
         seen, slit = self._cut_to_slit(view, left, right)

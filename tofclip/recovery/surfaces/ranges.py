@@ -319,7 +319,7 @@ class Step(NamedTuple):
     """A step as Gauss and Newton have it, and as it was taken, (unknowns,) both."""
 
     names: list[Unknown]
-    told: FloatArray
+    newton: FloatArray
     taken: FloatArray
 
 
@@ -329,8 +329,8 @@ def lengthen_step(change: FloatArray, history: Sequence[Step], metric: FloatArra
     that is nearest to none leads where steps would end (D. Anderson, J. ACM 12, 547, 1965). `metric`:
     of the normal equations, (unknowns, unknowns).
     """
-    told = [change, *(step.told for step in history)]
-    changed = np.array([a - b for a, b in itertools.pairwise(told)])
+    newton = [change, *(step.newton for step in history)]
+    changed = np.array([a - b for a, b in itertools.pairwise(newton)])
     weighted = changed @ metric
     known = weighted @ changed.T
     shares, *_ = np.linalg.lstsq(known, weighted @ change, rcond=None)
@@ -381,10 +381,10 @@ def refine_state(
     unit = np.sqrt(np.diag(equations.normal)) + TINY
     whole = (equations.normal + second) / np.outer(unit, unit) + RIDGE * np.eye(unit.size)
     inverse = np.linalg.inv(whole) / np.outer(unit, unit)
-    told = inverse @ (equations.slope - first)
+    newton = inverse @ (equations.slope - first)
     history = () if earlier is None or earlier.free is None else earlier.history
     history = tuple(itertools.takewhile(lambda step: step.names == names, history))
-    longer = [lengthen_step(told, history, equations.normal + second)] if history else []
+    longer = [lengthen_step(newton, history, equations.normal + second)] if history else []
     covariance = inverse
     if robust:
         covariance = equations.estimate_covariances(inverse, second, error)
@@ -399,7 +399,7 @@ def refine_state(
     settled, left = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
     before, state = compute_objective(model, left), model.state
     moved, free, rest = amplitude, amplitude + settled, left
-    halved = np.outer(0.5 ** np.arange(1 - np.log2(SMALLEST_STEP)), told)
+    halved = np.outer(0.5 ** np.arange(1 - np.log2(SMALLEST_STEP)), newton)
     with np.errstate(over="ignore", invalid="ignore"):
         for taken in (*longer, *halved):
             ahead = _move(model, state, amplitude, names, taken, changes)
@@ -407,7 +407,7 @@ def refine_state(
             settled, left = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
             if compute_objective(model, left) < before:
                 moved, free, rest = ahead, ahead + settled, left
-                history = (Step(names, told, taken), *history)
+                history = (Step(names, newton, taken), *history)
                 break
         else:
             model.place(state)
