@@ -37,7 +37,14 @@ from apps.viewer.look import render_pictures
 from apps.viewer.panels import Controls, add_export, add_selection
 from apps.viewer.points import POINT_STYLE, FramePacer, Points, draw_furniture
 from apps.viewer.session import DisplayedFrame, Session
-from apps.viewer.viewpoint import Box, Viewpoint, make_presets, move_camera, place_viewpoint
+from apps.viewer.viewpoint import (
+    Box,
+    Viewpoint,
+    make_presets,
+    move_camera,
+    place_viewpoint,
+    read_viewpoint,
+)
 from tofclip.errors import InputError, MissingDependencyError, TofclipError
 
 if TYPE_CHECKING:
@@ -346,14 +353,17 @@ class Page:
             self.points.note_movement()
             self._show_bar(client)
             aspect = camera.image_width / max(camera.image_height, 1)
-            if framed and not np.allclose(camera.position, framed[-1].eye, atol=1e-4):
+            if framed and not any(
+                np.allclose(camera.position, one.eye, atol=1e-4) for one in framed
+            ):
                 return  # moved by hand
             viewpoint = self.session.viewpoint or place_viewpoint(self._framed_cloud, aspect)
-            if framed and viewpoint.is_close_to(framed[-1]):
-                return
-            framed.append(viewpoint)
-            self.viewpoint = viewpoint
-            move_camera(camera, viewpoint)
+            if not framed or not viewpoint.is_close_to(framed[-1]):
+                framed.append(viewpoint)
+                self.viewpoint = viewpoint
+            # What it says may be older than what it was sent, and hides that more has to be sent.
+            if not viewpoint.is_close_to(read_viewpoint(camera)):
+                move_camera(camera, viewpoint)
 
         def redraw_pictures() -> None:
             self._pictures_at, self._pictured = 0.0, None

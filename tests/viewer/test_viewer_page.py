@@ -37,7 +37,7 @@ FLAGS = (
     "--disable-background-networking --disable-component-update --disable-sync"
 )
 LOADING_MS = 120_000  # a page and its first picture, while all cores compute something else
-PATIENCE_MS = 30_000  # a software renderer on a busy machine draws twice a second
+PATIENCE_MS = 60_000  # a software renderer on a busy machine draws twice a second
 WINDOW = {"width": 1024, "height": 700}
 SCENE = "canvas[data-engine]"
 # Says whether a page may open a WebSocket and receives something.
@@ -100,7 +100,8 @@ class Seen:
         self.tab.set_default_timeout(PATIENCE_MS)
         self.tab.on("console", self._listen)
         self.tab.on("pageerror", lambda fault: self.complaints.append(str(fault)))
-        self.tab.goto(page.address)
+        # A slow renderer would reduce the resolution, and say another size of the window.
+        self.tab.goto(f"{page.address}&fixedDpr=1")
         self.tab.locator("#label").wait_for(timeout=LOADING_MS)
         # that the renderer is a slow one
         notice = self.tab.locator("[class*=Notification-closeButton]")
