@@ -7,6 +7,8 @@ import pytest
 from physics_scenes import make_shot, plate
 
 import tofclip
+from tofclip.camera.registration import estimate_skew
+from tofclip.errors import CalibrationError
 
 
 def recover(shot, camera=None):
@@ -61,6 +63,23 @@ def test_a_delay_that_is_curved_along_the_slit_is_found_from_the_shot():
     # 0.8 mm by the true sweep; what is found of one is right to a tenth of a row of 3 mm
     assert found["median_mm"] < 1.1
     assert found["z"]["wall"] < 2
+
+
+def test_views_follow_each_other_in_little_light_but_not_in_none():
+    """Correlations of 50 photons are a third, of which noise takes the rest: delays of up to 12 rows are
+    found to 2 of them. Of 12 photons they are not, and the shot is refused.
+    """
+    shot = make_shot("wires", seed=1, photons=50, size=64)
+    found = estimate_skew(shot.counts, shot.camera)
+    assert found.correlations.min() < 0.4
+    lit = np.average(np.arange(shot.counts.shape[0]), weights=np.maximum(shot.counts - 3, 0).sum(1))
+    late, true = (
+        sweep.offsets_bin + sweep.stretches * lit for sweep in (found.sweep, shot.true_camera.sweep)
+    )
+    assert late == pytest.approx(true, abs=2.5)
+    dark = make_shot("wires", seed=1, photons=12, size=64)
+    with pytest.raises(CalibrationError, match="average shots"):
+        estimate_skew(dark.counts, dark.camera)
 
 
 @pytest.mark.parametrize(
