@@ -84,7 +84,7 @@ class SurfaceFit:
     reference: float
     # of the frames, where the shot shows light that no surface explains; ranges as measured
     others: Returns
-    whole: AmplitudeSolver  # with the light of those that are kept
+    whole: AmplitudeSolver  # with what is expected of their light
     seen: Returns  # of the frames, all
 
 
@@ -328,10 +328,14 @@ def _find_others(
     doubt = np.clip(np.nan_to_num(others.false_alarm, nan=SURE_FALSE_ALARM), LEAST_DOUBT, 0.5)
     known = [np.ones(shown.size), shown, scipy.special.logit(doubt)]
     doubt = scipy.special.expit(OTHER_ODDS @ np.array(known)).astype(np.float32)
-    others = replace(others, false_alarm=doubt)[doubt < 0.5]
-    # light of those that are dropped as all methods drop them goes to the others
-    kept = others[others.false_alarm <= DEFAULT_FALSE_ALARM]
-    return others, _add_returns(solver, kept, tick)[0]
+    others = replace(others, false_alarm=doubt)
+    # Nothing ties a single pixel's light to that of others: drawn is what is expected of it where it may
+    # be false, or noise (W. James and C. Stein, Proc. 4th Berkeley Symp. 1, 361, 1961). The light of
+    # those that are not drawn, or dropped as all methods drop them, goes to the others.
+    drawn = (doubt <= DEFAULT_FALSE_ALARM) & (shown > 1)
+    whole, own = _add_returns(solver, others[drawn], tick)
+    whole.amplitude[own] *= (1 - doubt[drawn]) * (1 - 1 / shown[drawn] ** 2)
+    return others[doubt < 0.5], whole
 
 
 def _add_returns(
