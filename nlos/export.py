@@ -102,10 +102,15 @@ def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
         xyz, brightness = extract_points(volume, fraction)
         x, y, z = (Column(n, "m", np.ascontiguousarray(xyz[:, i])) for i, n in enumerate("xyz"))
         write_table(path, [x, y, z, Column("brightness", "", brightness)])
-        return
-    require_suffix(path, *WRITERS, *POINT_SUFFIXES)
-    with atomic_path(path) as temporary:
-        WRITERS[suffix](volume, temporary)
+    elif suffix == ".exr":
+        from tofclip.io.light_fields import write_exr_parts
+
+        front = volume.maximum_projection()
+        write_exr_parts({"": {"Y": front.brightness, "Z": front.depth}}, path)
+    else:
+        require_suffix(path, *WRITERS, ".exr", *POINT_SUFFIXES)
+        with atomic_path(path) as temporary:
+            WRITERS[suffix](volume, temporary)
 
 
 def _write_vti(volume: Volume, path: Path) -> None:
@@ -130,16 +135,8 @@ def _write_npz(volume: Volume, path: Path) -> None:
         np.savez_compressed(file, values=to_numpy(volume.values), **axes)
 
 
-def _write_exr(volume: Volume, path: Path) -> None:
-    from tofclip.io.light_fields import write_exr_parts
-
-    front = volume.maximum_projection()
-    write_exr_parts({"": {"Y": front.brightness, "Z": front.depth}}, path)
-
-
 WRITERS: Mapping[str, Callable[[Volume, Path], None]] = {
     ".vti": _write_vti,
     ".npz": _write_npz,
-    ".exr": _write_exr,
 }
 POINT_SUFFIXES = (".ply", ".pcd", ".csv")

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import Float32Array, FloatArray, IntArray, to_numpy
 from tofclip.camera import Camera
 from tofclip.camera.noise import MeasurementNoise
-from tofclip.errors import InputError, ShapeError, require_type
+from tofclip.errors import InputError, ShapeError, require, require_type
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.pulse_tables import PictureTraces, PulseFilters, TraceBins, Traces
@@ -249,7 +249,7 @@ def depth(
     ------
     InputError
         Fewer than three frames, a camera for another picture size, or a probability of false alarms
-        for frames that do not know their measurements' noise.
+        that is none, or for frames that do not know their measurements' noise.
 
     Examples
     --------
@@ -264,6 +264,10 @@ def depth(
     (3, 4, 0.06)
     """
     require_type(frames, Frames, "returns are found in Frames, see tofclip.recover")
+    require(
+        false_alarm is None or 0 < false_alarm <= 1,
+        f"the probability of a false alarm lies between 0 and 1, got {false_alarm}",
+    )
     if frames.returns is not None and camera is None and detection is None and pulse is None:
         return keep_probable(frames.returns, false_alarm)
     camera = frames.camera if camera is None else camera

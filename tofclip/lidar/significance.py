@@ -180,12 +180,6 @@ class EvidenceJudge:
     pulse: Pulse
     max_false_alarm: float = DEFAULT_FALSE_ALARM
 
-    def __post_init__(self) -> None:
-        if not 0 < self.max_false_alarm <= 1:
-            raise InputError(
-                f"the probability of a false alarm lies between 0 and 1, got {self.max_false_alarm}"
-            )
-
     def judge(self, pixel: IntArray, time: FloatArray, signal: FloatArray) -> FloatArray:
         """Return the probability that each candidate is false. `pixel` (n,) does not decrease; `signal`
         (n,): counts, summed over the bins.

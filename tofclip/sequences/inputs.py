@@ -69,12 +69,20 @@ def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, 
     shots of a folder are left out. `bin_width`: duration of a row, s, which overrides time
     axes. `InputError`, `StorageError` or `FileFormatError` where there is none.
     """
+    import h5py
+
     path = Path(source)
     if path.is_dir() or not path.exists():
         return {
             name: FileShot(file, bin_width)
             for name, file in list_files(source, _may_be_shot).items()
         }
+    if not h5py.is_hdf5(path):
+        raise FileFormatError(
+            path,
+            "is one file and no sequence: shots come in a folder, by a pattern such as 'shots/*.tif', "
+            "or in an HDF5 stack",
+        )
     path = path.absolute()
     numbers = range(len(StreakStack(path)))
     return {f"{path.stem}_{number:06d}": StackShot(path, number, bin_width) for number in numbers}
