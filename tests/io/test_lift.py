@@ -33,14 +33,6 @@ def test_angles_and_centres_give_the_slit_columns_of_the_archives_formula(write_
             assert slit @ np.arange(60) == pytest.approx(expected_px[view], abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("region_px", "width_px"), [(173, 174), (179, 180), (182, 182), (174, 174), (1, 2)]
-)
-def test_the_picture_width_rounds_halves_up(write_lift, region_px, width_px):
-    camera = read_streak(write_lift(region_size_px=np.array(region_px), wall_grid_m=None)).camera
-    assert camera.image_shape == (width_px, width_px)
-
-
 def test_the_polynomial_map_in_the_archives_own_pixels(write_lift, lift_entries):
     sweep = read_streak(write_lift()).camera.sweep
     assert isinstance(sweep, PolynomialSweep)

@@ -13,7 +13,6 @@ from tofclip.errors import (
     InputError,
     MissingTimeAxisError,
     StorageError,
-    TofclipError,
 )
 from tofclip.io import read_streak
 from tofclip.shots import Frames, Streak
@@ -84,24 +83,6 @@ def test_unusable_pictures_are_refused(plain, picture, fault, problem):
         read_streak(plain(picture, **options))
 
 
-def test_damaged_tiffs_raise_only_our_own_errors(write_hpdta, capfd):
-    path = write_hpdta(np.arange(20))
-    whole, random = path.read_bytes(), np.random.default_rng(4)
-    messages = []
-    for _ in range(150):
-        damaged = np.frombuffer(whole, np.uint8).copy()
-        damaged[random.integers(0, 400, 4)] = random.integers(0, 256, 4)
-        path.write_bytes(damaged.tobytes())
-        try:
-            read_streak(path)
-        except TofclipError as fault:
-            messages.append(str(fault))
-    assert len(messages) > 20
-    assert not any("\n" in message for message in messages)
-    # The decoder keeps quiet: the one line is ours.
-    assert capfd.readouterr() == ("", "")
-
-
 @pytest.mark.parametrize(
     "content", [b"", b"hello, this is no picture", b"PK\x03\x04rest", b"II*\0", b"%PDF-1.4"]
 )
@@ -116,21 +97,6 @@ def test_other_files_are_refused_whatever_they_are_called(tmp_path, name, conten
 def test_an_impossible_bin_width_is_refused(plain, bin_width):
     with pytest.raises(InputError, match="bin width must be a positive number of seconds"):
         read_streak(plain(np.ones((4, 5), np.uint16)), bin_width=bin_width)
-
-
-@pytest.mark.parametrize("keep", [4, 8, 100, 600, 1000])
-@pytest.mark.parametrize("kind", ["hpdta", "lift", "hdf5"])
-def test_truncated_files_are_refused(write_hpdta, write_lift, tmp_path, pixels, kind, keep):
-    path = tmp_path / "shot.h5"
-    if kind == "hdf5":
-        Streak(pixels).save(path)
-    else:
-        path = write_lift() if kind == "lift" else write_hpdta(np.arange(20))
-    data = path.read_bytes()
-    assert len(data) > keep
-    path.write_bytes(data[:keep])
-    with pytest.raises(FileFormatError, match="shot"):
-        read_streak(path)
 
 
 def claim_too_much(path):

@@ -18,7 +18,6 @@ from tofclip.lidar.photons import (
 )
 from tofclip.lidar.photons.image import find_hot_pixels, leave_out_pixels
 from tofclip.lidar.photons.scene import BinnedResponse, Scene, measure_pulse_width
-from tofclip.lidar.photons.surface import keep_significant
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN = 80e-12
@@ -169,19 +168,6 @@ def test_the_search_keeps_to_its_memory(monkeypatch):
     tracemalloc.stop()
     assert peak < limit
     assert 8 * 128 * 128 * axis.numbers.size <= limit
-
-
-def test_a_further_surface_is_kept_where_chance_is_below_one_in_fifty():
-    """Of a mean of one photon, four or more come with 1.90 %, three or more with 8.03 %."""
-    response = BinnedResponse(Pulse.gaussian(FWHM).integrate_bins(BIN), BIN)
-    bins_seen = 2 * (0.5 * response.width + 1) + 1
-    scene = Scene(response, 1 / bins_seen)
-    counts = np.zeros((7, 7, 60))
-    counts[..., 30] = 4
-    counts[3, 3, 30] = 3
-    layer = np.ones((7, 7, 4)) * [30.0, 0.5, 4.0, 0.1]
-    kept = np.isfinite(keep_significant(PhotonImage.from_cube(counts, BIN), scene, layer)[..., 0])
-    np.testing.assert_array_equal(np.argwhere(~kept), [[3, 3]])
 
 
 ROWS, COLUMNS, HOT_BINS = 32, 40, 200

@@ -8,9 +8,6 @@ from scipy.ndimage import gaussian_filter
 
 from tofclip.lidar.neighbours import (
     add_recovery_error,
-    allocate_window,
-    layer_returns,
-    scatter_about_surfaces,
 )
 from tofclip.lidar.peak_kernels import pool_significance
 
@@ -101,29 +98,3 @@ def test_neighbours_count_within_a_ball_whose_radius_in_range_is_in_gates():
         pool_significance(pixel, distance, own, starts, (7, 7), (4.0, 0.01), pooled)
         assert pooled[0] == (3.0 if counted else 1.0)
         assert pooled[2] == 4.0
-
-
-def test_the_scatter_counts_the_numbers_that_a_quadratic_took():
-    """Six, of some twenty neighbours."""
-    random, rows = np.random.default_rng(0), 4
-    columns = 40 // rows - 1
-    height = 2 * rows - 1
-    pixel = np.array(
-        [y * columns + x for y in range(0, height, 2) for x in range(0, columns, 2)], np.int64
-    )
-    starts = np.searchsorted(pixel, np.arange(height * columns + 1))
-    x, y = pixel % columns, pixel // columns
-    surface = 0.3 * x - 0.2 * y + 0.02 * x * x - 0.03 * x * y + 0.01 * y * y
-    own = np.array([pixel.size // 2])
-    found = np.empty(2000)
-    window, scatter = allocate_window(), np.empty(pixel.size)
-    for place in range(found.size):
-        nearness = surface + random.normal(0, 1, pixel.size)
-        layers = layer_returns(nearness, pixel, starts, (height, columns))
-        ones = np.ones(pixel.size)
-        arguments = nearness, ones, pixel, columns, layers, 1e3, own, window, scatter
-        scatter_about_surfaces(*arguments)
-        found[place] = scatter[own[0]]
-    # Medians of so few are some per cent off by themselves; without the terms it would be less by
-    # the root of (20 - 6) / 20, 0.84.
-    assert found.mean() == pytest.approx(1, abs=0.1)

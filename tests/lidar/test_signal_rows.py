@@ -96,11 +96,6 @@ def test_the_light_of_a_single_pixel_is_seen_wherever_it_is(find_bins, seed):
     assert np.isin(around, bins.numbers[bins.bin_weights == 1]).all()
 
 
-def test_a_higher_limit_looks_at_less(find_bins):
-    measurements = with_pixel(dark(3), (16, 16), 300.0, 12.0)
-    assert not find_bins(measurements, 15.0).search_mask.any()
-
-
 @pytest.mark.parametrize("case", ["no limit", "nowhere dark", "nothing measured"])
 def test_everything_is_searched_where_nothing_tells_the_dark(find_bins, case):
     measurements = np.zeros((240, ROWS), np.float32) if case == "nothing measured" else dark(0)
@@ -194,29 +189,6 @@ def test_bright_frames_are_those_of_the_whole_filter(limit, light):
     assert np.abs(expected - limit).min() > 1e-5
     bright = BrightFrameFinder(tiles, 170, GROUP_PIXELS).find(block, span, limit)
     np.testing.assert_array_equal(bright, expected >= limit)
-
-
-def test_dead_measurements_are_left_out_of_the_filter():
-    alive = np.arange(170) != 60
-    prepared = LinearInverse().prepare(narrow_camera(60).operator(), alive)
-    tiles = InverseTraces(prepared, order_by_patch(NARROW)).tiles
-    block = np.random.default_rng(0).standard_normal((170, 4 * LANES)).astype(np.float32)
-    expected = filter_responses(prepared.operator.matrix.toarray() * alive[:, np.newaxis], block)
-    bright = BrightFrameFinder(tiles, 170, GROUP_PIXELS).find(block, slice(0, 4 * LANES), 3.2)
-    np.testing.assert_array_equal(bright, expected >= 3.2)
-
-
-def test_any_nonnegative_matrix_and_any_limit_will_do():
-    random = np.random.default_rng(1)
-    matrix = scipy.sparse.random_array((50, 90), density=0.1, rng=random).astype(np.float32)
-    finder = BrightFrameFinder(Tiles.from_csr(matrix.T.tocsr()), 50, GROUP_PIXELS)
-    block = random.standard_normal((50, 2 * LANES)).astype(np.float32)
-    span = slice(0, 2 * LANES)
-    expected = filter_responses(matrix.toarray(), block)
-    np.testing.assert_array_equal(finder.find(block, span, 3.0), expected >= 3.0)
-    assert finder.find(block, span, 0.0).all()
-    assert not finder.find(block, span, 100.0).any()
-    assert not finder.find(-np.abs(block), span, 1e-3).any()
 
 
 def test_negative_entries_are_refused():

@@ -9,20 +9,8 @@ import pytest
 
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, Pulse, depth
-from tofclip.lidar.fit_kernels import fit_returns
-from tofclip.lidar.peak_kernels import (
-    CANDIDATE_COLUMNS,
-    FIRST_OFFSET,
-    HEIGHT,
-    MOVED,
-    OFFSET,
-    PEAK_BIN,
-    Room,
-)
 from tofclip.lidar.pulse_tables import (
-    MAX_OFFSET_BINS,
     PhaseTable,
-    TraceBins,
 )
 from tofclip.shots import Frames
 
@@ -86,48 +74,3 @@ def test_returns_that_overlap_are_fitted_as_exactly(apart):
 
 def add_dim(bright, dim):
     return replace(bright, values=bright.values + np.float32(0.3) * dim.values)
-
-
-def test_bins_whose_neighbours_are_not_held_are_left_to_the_exact_fit():
-    table = PhaseTable.tabulate(Pulse.gaussian(FWHM), TIMES)
-    numbers = np.r_[0:20, 22:60]
-    bins = TraceBins(numbers, np.ones(58, bool), np.ones(58, np.float32))
-    even = table.find_even_bins(bins)
-    half = table.half
-    assert np.flatnonzero(even).tolist() == [*range(half, 20 - half), *range(20 + half, 58 - half)]
-
-
-@pytest.mark.parametrize(("peak", "there"), [(27, True), (33, True), (56, False)])
-def test_a_return_is_followed_when_it_moves_away_from_its_peak(peak, there):
-    """As far as the bins around it are held; beyond, the exact fit takes over, which begins where the
-    return was before any fit.
-    """
-    table = PhaseTable.tabulate(Pulse.gaussian(FWHM), TIMES)
-    arrival = 30.2 if there else peak + 2.0
-    traces = np.zeros((2, 64), np.float32)
-    traces[0, :BINS] = 100 * Pulse.gaussian(FWHM)(TIMES - TIMES[0] - BIN * arrival) + 3
-    candidates = np.zeros((1, CANDIDATE_COLUMNS))
-    candidates[0, [PEAK_BIN, MOVED, OFFSET, FIRST_OFFSET]] = peak, np.inf, 0.1, 0.1
-    rests = np.zeros((1, table.shapes.shape[1]), np.float32)
-    rests[0, : 2 * table.half + 1] = np.pad(traces[0] - 3, 9)[9 + peak - table.half :][
-        : 2 * table.half + 1
-    ]
-    even = table.find_even_bins(TraceBins.all_bins(BINS))
-    room = Room(
-        **dict.fromkeys(("score", "responses", "free"), np.empty(0, np.float32)),
-        **dict.fromkeys(("peaks", "estimates"), np.empty((0, 2))),
-        fitted=np.zeros(1, np.int64),
-        level=np.empty(0),
-        places=np.empty((4, 0), np.int32),
-        moments=np.array([[3.0, 1.0]]),
-        candidates=candidates,
-        rests=rests,
-    )
-    fit_returns(traces[:1], table, even, room, 1)
-    assert candidates[0, PEAK_BIN] + candidates[0, FIRST_OFFSET] == pytest.approx(peak + 0.1)
-    if there:
-        assert candidates[0, PEAK_BIN] + candidates[0, OFFSET] == pytest.approx(30.2, abs=1e-3)
-        assert abs(candidates[0, OFFSET]) <= MAX_OFFSET_BINS
-        assert candidates[0, HEIGHT] == pytest.approx(100, rel=1e-3)
-    else:
-        assert np.isnan(candidates[0, HEIGHT])

@@ -18,12 +18,9 @@ from scenes import (
     voxels_of,
 )
 
-import nlos.backprojection
 from nlos import Backprojection, Capture, FilteredBackprojection, Grid
-from nlos.backprojection import Weighting, _apply_laplacian, backproject_signals
-from nlos.band import Waveforms
+from nlos.backprojection import Weighting
 from nlos.capture import TimeAxis
-from nlos.method import ignore_progress
 
 METHOD = Backprojection(wavelength=0.125, cycles=3)
 # Odd sizes, none of them a multiple of the brick, and HIDDEN among the voxels.
@@ -52,14 +49,6 @@ def test_the_volume_may_be_cut_into_pieces_and_the_signal_be_in_double_precision
     for z in range(GRID.z.size):
         plane = METHOD.phasor_field(capture, Grid(GRID.x, GRID.y, GRID.z[z : z + 1])).values
         assert np.array_equal(plane[0], whole[z])
-
-
-@pytest.mark.parametrize("confocal", [False, True])
-def test_small_batches_of_wall_points_add_up(confocal, capture, monkeypatch):
-    same_spot = replace(capture, laser=capture.wall if confocal else capture.laser)
-    whole = METHOD.phasor_field(same_spot, GRID).values
-    monkeypatch.setattr(nlos.backprojection, "TABLE_BYTES", 1)
-    assert relative_error(METHOD.phasor_field(same_spot, GRID).values, whole) < 1e-5
 
 
 def test_voxels_on_the_wall_stay_finite_and_those_beyond_the_record_dark(capture):
@@ -111,40 +100,6 @@ def test_all_lasers_of_a_grid_are_summed_as_if_each_were_alone():
 
 
 # --- filtered back-projection
-
-
-def test_unfiltered_signals_are_read_between_bins_and_nowhere_else():
-    """One wall point, one voxel: the signal at the path between them, interpolated by hand."""
-    wall = np.array([[0.0, 0, 0], [5.0, 0, 0]])
-    signal = np.random.default_rng(1).uniform(1, 2, (AXIS.bins, 2)).astype(np.float32)
-    signal[:, 1] = 0
-    capture = Capture(signal, wall, [0.2, 0, 0], AXIS.bin_width, AXIS.start)
-    depths = 0.2 + 0.01 * np.arange(120)
-    path = depths + np.hypot(depths, 0.2)
-
-    def unfiltered(traces):
-        values = np.pad(traces, ((0, 0), (1, 2))).astype(np.complex64)
-        return Waveforms(values, AXIS.start - AXIS.spacing, AXIS.spacing)
-
-    grid = Grid([0.0], [0.0], depths)
-    field = backproject_signals(capture, grid, unfiltered, 10, Weighting(0.0), ignore_progress)
-    found, expected = field[:, 0, 0].real, np.interp(path, AXIS.paths, signal[:, 0])
-    inside = (path > AXIS.start) & (path < AXIS.paths[-1])
-    # float32 paths are good to 1e-7 m of 5e-3.
-    assert found[inside] == pytest.approx(expected[inside], abs=1e-3)
-    far = (path < AXIS.start - AXIS.spacing) | (path > AXIS.paths[-1] + AXIS.spacing)
-    assert np.all(found[far] == 0)
-
-
-def test_the_laplacian_is_that_of_metres():
-    """Of a quadratic volume it is a constant, whatever the voxels' shape."""
-    grid = Grid(0.01 * np.arange(41), 0.008 * np.arange(51), 0.005 * np.arange(81))
-    values = (voxels_of(grid) ** 2 @ np.array([3, 5, 7])).astype(np.float32)
-    found = _apply_laplacian(values, grid, 0.02)[40, 25, 20]
-    # A Gaussian of two to four voxels, sampled: errs by less than a percent.
-    assert found == pytest.approx(-(0.02**2) * 2 * (3 + 5 + 7), rel=0.01)
-    flat = _apply_laplacian(values[..., :1], Grid([0.0], grid.y, grid.z), 0.02)[40, 25, 0]
-    assert flat == pytest.approx(-(0.02**2) * 2 * 12, rel=0.01)
 
 
 def test_uneven_voxels_are_refused(capture):

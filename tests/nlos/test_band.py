@@ -61,16 +61,3 @@ def test_phasors_are_the_weighted_fourier_sum_of_their_definition():
 def test_what_is_no_band_is_refused(wavelength, cycles, message):
     with pytest.raises(InputError, match=message):
         Band(VirtualPulse(wavelength, cycles), AXIS)
-
-
-def test_tails_too_small_for_normal_numbers_change_nothing():
-    """Simulated pulses fade to 1e-38 and below, which a processor multiplies ten times as slowly."""
-    random, band = np.random.default_rng(0), Band(VirtualPulse(0.125, 3), AXIS)
-    signal = random.normal(size=(6, AXIS.bins)).astype(np.float32)
-    tails = np.where(random.random(signal.shape) < 0.5, np.float32(1e-38) * signal, signal)
-    clean = np.where(np.abs(tails) < 1e-30, np.float32(0), tails)
-    assert np.array_equal(band.compute_phasors(tails), band.compute_phasors(clean))
-    # faint signals are no tails
-    faint = band.compute_phasors(np.float32(1e-25) * signal)
-    expected = 1e-25 * band.compute_phasors(signal).astype(np.complex128)
-    assert norm(faint - expected) < 1e-5 * norm(expected)

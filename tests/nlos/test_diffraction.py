@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from exact_phasor_field import compute_exact_phasor_field
 from scenes import (
-    FINE_DEPTHS,
     JITTER,
     LONG,
     SHAPED,
@@ -34,10 +33,9 @@ from scenes import (
 import nlos.method
 import nlos.phasor.depth_steps
 import nlos.phasor.to_depths_compiled
-from nlos import Capture, Grid, Hybrid, PlanarRSD
+from nlos import Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
 from nlos.phasor import fourier, wall_to_plane
-from nlos.phasor.to_depths_compiled import DEPTH_ERROR_FRACTION
 from nlos.plane import Plane
 from tofclip.errors import InputError
 
@@ -136,21 +134,6 @@ def test_planes_are_checked(axes, message):
 # --- transforms
 
 
-def test_both_ways_back_from_the_spectrum_agree(monkeypatch):
-    for grid in (
-        UNEVEN_DEPTHS,
-        Grid(UNEVEN_DEPTHS.x[::4], UNEVEN_DEPTHS.y[::3], UNEVEN_DEPTHS.z),
-        Grid(np.arange(-0.2, 0.2, 0.01), UNEVEN_DEPTHS.y, UNEVEN_DEPTHS.z[:1]),
-    ):
-        fields = []
-        # Matrix products, Fourier transforms, and a few spectra of these at a time.
-        for rate, cached in ((0, 1 << 19), (np.inf, 1 << 19), (0, 12_000), (np.inf, 12_000)):
-            monkeypatch.setattr(nlos.phasor.to_depths_compiled, "PRODUCT_SPEEDUP", rate)
-            monkeypatch.setattr(nlos.phasor.to_depths_compiled, "CACHE_BYTES", cached)
-            fields.append(METHOD.phasor_field(scene(), grid).values)
-        assert all(relative_error(field, fields[0]) < 1e-5 for field in fields)
-
-
 def test_images_without_fftw(monkeypatch):
     monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
     cases = (METHOD, scene(), UNEVEN_DEPTHS), (HYBRID, truth("relief")[0], SHAPED)
@@ -170,23 +153,6 @@ def test_transforms_load_neither_dask_nor_pandas():
 
 
 # --- depths that are interpolated instead of computed
-
-
-@pytest.mark.parametrize(
-    "laser",
-    [[0.12, 0.05, 0.0], [0.1, 0.0, 0.3], planar_wall()],
-    ids=["single", "ahead", "confocal"],
-)
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
-def test_interpolated_depths_are_those_that_are_computed(laser, tolerance, monkeypatch):
-    """Signals of noise: light from everywhere at any time; depths an eighth of a wavelength apart."""
-    signal = np.random.default_rng(1).normal(size=(LONG.bins, 17, 21)).astype(np.float32)
-    capture = Capture(signal, planar_wall(), np.array(laser), LONG.bin_width, LONG.start)
-    method = replace(METHOD, tolerance=tolerance)
-    found = method.phasor_field(capture, FINE_DEPTHS).values
-    monkeypatch.setattr(nlos.phasor.depth_steps, "SPACING_RATIOS", ())
-    expected = method.phasor_field(capture, FINE_DEPTHS).values
-    assert 0 < relative_error(found, expected) < DEPTH_ERROR_FRACTION * tolerance
 
 
 # --- progress of several steps

@@ -9,7 +9,6 @@ from scenes import scaled_error
 
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD, Refinement, settings_for
 from nlos.capture import TimeAxis
-from nlos.illumination import choose_roles
 from nlos.simulate import PointScene, add_poisson_noise
 from tofclip.solvers import Sparse
 
@@ -46,16 +45,6 @@ def test_many_spots_show_what_backprojection_shows(kind):
     # The tolerance of each way, and of waves that meet no distance any more.
     assert scaled_error(found.values, exact.values) < 0.02
     assert found.provenance["imaging"]["method"] in ("rsd", "hybrid")
-
-
-def test_spots_that_light_the_same_wall_share_one_plan():
-    plan = PlanarRSD(WAVELENGTH).plan(exhaustive("planar"), GRID)
-    assert plan.images == 2
-    assert plan.groups[0].plane_to_depths is plan.groups[1].plane_to_depths
-    scanned = PlanarRSD(WAVELENGTH).plan(exhaustive("planar, scanned"), GRID)
-    # Two for each of two detectors, not one for each of 256 spots.
-    assert scanned.images == 4
-    assert choose_roles(exhaustive("planar")) is exhaustive("planar")
 
 
 @pytest.mark.parametrize("spots", [1, 2, 4])

@@ -6,22 +6,18 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.linalg import norm
-from scenes import FIVE_POINTS, distance_to_nearest, energy_fraction, planar_wall, see
+from scenes import FIVE_POINTS, distance_to_nearest, energy_fraction, planar_wall
 
 from nlos import Capture, Grid, Hybrid
 from nlos.capture import TimeAxis
 from nlos.refinement.photons import (
-    HELD_OUT_FRACTION,
     LINEAR_SHOWN,
     CountedPhotons,
     PhotonFit,
     PhotonRefinement,
     TimeOfFlight,
     build_response,
-    compare_likelihoods,
     compute_beam,
-    fit_brightness,
-    judge,
 )
 from nlos.simulate import HiddenScene, PointScene, Surface, add_poisson_noise, build_relay_wall
 from tofclip.errors import InputError
@@ -89,20 +85,6 @@ def test_light_and_backprojection_are_adjoint(obliquity, laser):
     assert np.sum(light * values) == pytest.approx(np.sum(albedo * back), rel=1e-5)
 
 
-def test_a_small_voxels_light_is_that_of_a_point():
-    capture = expected("cylinder", "points", 8)
-    x, y, z = FIVE_POINTS[1]
-    grid = Grid(x + np.array([0.0, 1e-3]), y + np.array([0.0, 1e-3]), z + np.array([0.0, 1e-3]))
-    response = np.exp(-((np.arange(-4, 5) / (20 / 32)) ** 2) / 2)
-    model = TimeOfFlight(capture, grid, response / response.sum())
-    light = model.compute_light(np.ones(1), np.zeros(1, int), np.arange(64))
-    true = see(FIVE_POINTS[1:2], capture.wall, capture.laser, AXIS).traces()
-    assert np.allclose(light.sum(axis=1), true.sum(axis=1), rtol=3e-4)
-    arrival, exact = ((one * AXIS.paths).sum(axis=1) / one.sum(axis=1) for one in (light, true))
-    # float32 paths
-    assert np.abs(arrival - exact).max() < 1e-3
-
-
 @pytest.mark.parametrize("wall", ["planar", "cylinder"])
 def test_few_photons_show_points(wall):
     """1.15 photons per wall point of 64 x 64, on 16 x 16 points: as many in all."""
@@ -165,18 +147,6 @@ def test_photons_set_aside_know_nothing_of_the_others():
     assert abs(held.sum() - total / 4) < 4 * np.sqrt(total * 3 / 16)
 
 
-def test_brightness_of_known_light_is_found():
-    capture = count("planar", "points", 20, 16, seed=0)
-    photons, light = CountedPhotons.of(capture), expected("planar", "points", 16).traces()
-    found = fit_brightness(photons, light)
-    truth = light * (20 * 64**2 / light.sum(dtype=float)) + BACKGROUND
-    # Of many photons, Poisson's noise leaves a percent.
-    assert found.sum() == pytest.approx(photons.counts.sum(), rel=0.01)
-    assert norm(found - truth) < 0.03 * norm(truth)
-    gain, noise = compare_likelihoods(photons.counts, truth, np.ones_like(truth), photons.observed)
-    assert gain > 10 * noise > 0
-
-
 def test_the_walls_own_light_is_left_out_of_account():
     """Glare in the first 0.2 m after the direct path changes nothing but what it blanks."""
     capture = count("planar", "points", 20, 16, seed=2)
@@ -228,20 +198,6 @@ def point_albedo(grid, *places):
     for place in places:
         albedo[grid.find_nearest(place)] = 1
     return albedo.ravel()
-
-
-def test_photons_set_aside_prefer_the_fit_that_is_as_bright_as_the_scene():
-    fit = make_fit(WALL, GRID, point_albedo(GRID, (0.1, 0.0, 0.7), (-0.2, 0.2, 0.9)))
-    fit.improve(1)
-    # What the kept photons are of is what this fit expects; of all photons a tenth was set aside.
-    fit.photons = replace(fit.photons, counts=fit.expect())
-    held = fit.photons.counts * HELD_OUT_FRACTION / (1 - HELD_OUT_FRACTION)
-    light = fit.model.compute_light(np.ones(GRID.size), fit.voxels, np.arange(64))
-    albedo, background, gains = fit.albedo, fit.background, {}
-    for scale in (0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2):
-        fit.albedo, fit.background = albedo * np.float32(scale), background * np.float32(scale)
-        gains[scale] = judge(fit, light, held)[0]
-    assert max(gains, key=lambda scale: gains[scale]) == 1.0
 
 
 def test_what_voxels_pay_does_not_depend_on_the_parts_of_the_wall():

@@ -41,7 +41,7 @@ from nlos import (
     Volume,
     propagate,
 )
-from nlos.backprojection import BYTES_PER_PAIR, Weighting
+from nlos.backprojection import Weighting
 from nlos.capture import remove_device_legs
 from nlos.compressed import CompressedCapture
 from nlos.phasor import wall_to_plane
@@ -162,24 +162,6 @@ def test_the_field_is_that_of_the_compiled_loops(case):
     assert found.find_brightest() == expected.find_brightest()
 
 
-def test_the_field_on_a_plane_is_that_of_the_compiled_loops(
-    monkeypatch,
-):
-    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: True)
-    capture = see_shaped("cylinder", 12)
-    plane = HYBRID.plan(capture, SHAPED).plane
-    # A lattice that suits the plane no better than the wall.
-    uneven = replace(plane, x=plane.x * 1.01)
-    # At the stricter tolerance rounding decides which of the last terms is taken.
-    for tolerance, agreement in ((1e-2, 5e-5), (1e-3, 2e-4)):
-        expected, found = (
-            propagate(one, uneven, HYBRID.pulse, tolerance=tolerance)
-            for one in (capture, capture.on(find_device("torch")))
-        )
-        assert np.array_equal(found.wavenumbers, expected.wavenumbers)
-        assert relative_error(found.values, expected.values) < agreement
-
-
 @libraries
 def test_a_volume_looks_the_same_wherever_it_lives(library, tmp_path):
     expected = RSD.reconstruct(see_planar(), UNEVEN_DEPTHS)
@@ -280,21 +262,6 @@ def test_little_memory_means_smaller_pieces(name, kept, monkeypatch):
     assert len(counted) > 2
 
 
-@pytest.mark.parametrize("laser", ["single", "paired"])
-def test_pieces_of_a_backprojection_make_up_the_whole_and_progress_counts_them(laser, monkeypatch):
-    capture = see_curved(laser).on(find_device("array_api_strict"))
-    layer = Grid(UNEVEN.x, UNEVEN.y, UNEVEN.z[1:2])
-    whole = to_numpy(BACKPROJECTION.phasor_field(capture, layer).values)
-    for table, pairs in ((1 << 20, 7), (1, 1 << 20)):
-        monkeypatch.setattr(nlos.backprojection, "DEVICE_TABLE_BYTES", table)
-        monkeypatch.setattr(ArrayLibrary, "chunk_bytes", pairs * BYTES_PER_PAIR)
-        counted = []
-        found = BACKPROJECTION.phasor_field(capture, layer, counted.append).values
-        assert relative_error(found, whole) < 1e-6
-        assert sum(counted) == len(capture.points) * layer.size
-        assert len(counted) > 10
-
-
 # --- nothing hides on the processor
 
 
@@ -389,13 +356,6 @@ def test_fields_stay_on_their_device(
     # On purpose only the sample of phasors that terms are chosen by is fetched.
     assert len(sizes) == (faster is not None)
     assert all(size < 1024 * 100 for size in sizes)
-
-
-def test_preparation_stays_on_its_device(elsewhere):
-    capture = mask(see_planar(), (2, 3))
-    for prepare in PREPARATIONS:
-        found = elsewhere.fetch(prepare(capture.on(elsewhere.device)).signal)
-        assert_allclose(found, prepare(capture).signal, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("method", [RSD, HYBRID, BACKPROJECTION])

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from scenes import planar_wall, scaled_error, see
 
-from nlos import Backprojection, Capture, Grid, PlanarRSD, preparation, settings_for
+from nlos import Backprojection, Capture, Grid, PlanarRSD, settings_for
 from nlos.capture import TimeAxis
 from nlos.preparation import (
     MidpointImaging,
-    MidpointJoin,
     crop_capture,
     fade_record_end,
     flip_capture,
@@ -146,25 +145,6 @@ def test_pairs_a_decimetre_apart_are_imaged_at_their_midpoint(apart, error):
     bare = PlanarRSD(WAVELENGTH).reconstruct(replace(joined, signal=capture.signal), GRID).values
     assert scaled_error(bare, exact) > 1.4 * scaled_error(found, exact)
     assert settings_for(capture, wavelength=WAVELENGTH).method == "rsd"
-
-
-def test_paths_of_pairs_are_found_once_for_many_captures(monkeypatch):
-    capture = see_pairs(0.1, 12)
-    kept = MidpointJoin(capture)
-    monkeypatch.setattr(preparation, "MAX_KEPT_BYTES", 0)  # found again every time
-    anew = MidpointJoin(capture)
-    found, path_of = [], preparation._path_of
-    monkeypatch.setattr(preparation, "_path_of", lambda *a: found.append(1) or path_of(*a))
-    for factor in (1, 3):
-        brighter = replace(capture, signal=capture.signal * np.float32(factor))
-        joined = kept.join(brighter)
-        assert not found
-        assert joined.signal.any()
-        assert np.array_equal(joined.signal, anew.join(brighter).signal)
-        assert found
-        found.clear()
-    with pytest.raises(InputError, match="planned for"):
-        kept.join(replace(capture, start=0.1))
 
 
 def test_pairs_far_apart_stay_as_they_are():

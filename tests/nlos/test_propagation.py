@@ -19,19 +19,18 @@ from scenes import (
 )
 
 import nlos.phasor.propagate
-from nlos import Grid, Hybrid, propagate
+from nlos import propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
-from nlos.illumination import build_waves, group_by_illumination
 from nlos.phasor import wall_to_plane
 from nlos.phasor.propagate import (
     estimate_strength,
     propagate_direct,
     propagate_low_rank,
 )
-from nlos.phasor.transfer import Offsets, SphericalWaves, find_min_periods
+from nlos.phasor.transfer import SphericalWaves
 from nlos.phasor.wall_to_plane import WallBeforePlane, plan_transforms
-from nlos.plane import Plane, VirtualPlane
+from nlos.plane import Plane
 
 PULSE = VirtualPulse(0.25, 4.24)
 BAND = Band(PULSE, TimeAxis(512, 32e-12))
@@ -171,20 +170,6 @@ def test_it_is_the_direct_sum_within_the_tolerance(number):
         assert relative_error(found, exact) < tolerance
 
 
-def test_few_depths_take_few_terms(always):
-    """One for a planar wall, two for two plates, whatever their distance; more for a smooth relief."""
-
-    def counts(points, tolerance=1e-2):
-        return make_plan(points, FITTING, tolerance).low_rank_transfer.term_counts
-
-    assert set(counts(points_of("planar"))) == {1}
-    assert max(counts(points_of("plates"))) == 2
-    relief = points_of("relief")
-    assert sum(counts(points_of("cylinder"))) < sum(counts(relief)) < sum(counts(relief, 1e-3))
-    pytest.importorskip("finufft", reason="finufft is optional")
-    assert set(counts(CLOUD * [1, 1, 0])) == {1}
-
-
 def test_silence_and_a_single_frequency_pass(always):
     points = points_of("relief")
     values = np.zeros_like(phasors(len(points)))
@@ -214,34 +199,3 @@ def test_scattered_points_take_it_where_it_is_faster_and_installed(
 
 
 # --- the virtual plane
-
-
-def test_a_period_holds_a_plane_that_is_wider_than_the_windows():
-    """Many zones beside a small wall: the plane's own width decides."""
-    sources = VirtualPlane(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), 0.2, (1.4, 1.4))
-    axis = np.linspace(-0.1, 0.1, 3)
-    offsets = Offsets.between(sources, axis, axis).limit(0.2, (0.7, 0.7))
-    assert find_min_periods(offsets, 1e-2) == pytest.approx((2.1, 2.1))
-
-
-def test_lattices_are_as_short_as_the_paths_allow():
-    """From the wall to a plane before it, and from there to depths as from a planar wall."""
-    wall, axis = shaped_wall("relief", 64), np.linspace(-1, 1, 64)
-    capture = see([[0, 0, 2.0]], wall, SHAPED_SPOT, TimeAxis(64, 32e-12), SHAPED_JITTER)
-    plan = Hybrid(0.125, 4.24).plan(capture, Grid(axis, axis, np.linspace(0.6, 1.6, 4)))
-    limited = plan.groups[0].plane_to_depths
-    whole = replace(limited, paths=None)
-    assert (limited.lattice, whole.lattice) == ((160, 160), (192, 192))
-    assert limited.plane_wave_count < 0.75 * whole.plane_wave_count
-    waves = build_waves(group_by_illumination(capture)[0], plan.band, continued=False)
-    geometry = replace(WallBeforePlane.of(capture.points, limited.plane), paths=limited.paths)
-    narrow, wide = (
-        plan_transforms(some, waves, np.ones(waves.count), 6e-3)
-        for some in (geometry, replace(geometry, paths=None))
-    )
-    assert narrow is not None
-    assert wide is not None
-    assert plan_transforms(geometry, waves, np.ones(waves.count), 1e-4) is None  # too strict
-    assert (narrow.lattice, wide.lattice) == ((144, 144), (240, 240))
-    # What fades before it reaches a voxel is left out, which are many waves of low frequencies.
-    assert narrow.lateral_limits[0] < 0.85 * wide.lateral_limits[0]

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from nlos import Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
-from nlos.resolution import compute_diffraction_limit, measure_fwhm
+from nlos.resolution import compute_diffraction_limit
 from nlos.simulate import add_poisson_noise, build_relay_wall
 
 WAVELENGTH, CYCLES, SIDE = 0.08, 6.0, 1.0
@@ -42,12 +42,6 @@ def test_a_point_is_as_wide_as_diffraction_and_the_pulse_make_it(depth):
     # The envelope exp(-L^2 / 2 sigma^2) over the path there and back.
     pulse = np.sqrt(8 * np.log(2)) * METHOD.pulse.sigma / 2
     assert full_width_at_half_maximum(along, axial) == pytest.approx(pulse, rel=0.1)
-
-
-def test_a_width_is_read_between_samples():
-    axis = np.arange(11.0)
-    assert measure_fwhm(axis, 1 - np.abs(axis - 5) / 3, 5) == pytest.approx(3.0)
-    assert measure_fwhm(2 * axis, np.exp2(-(((axis - 5) / 2) ** 2)), 5) == pytest.approx(8.0)
 
 
 def test_the_limit_is_the_width_of_the_sum_that_defines_it():

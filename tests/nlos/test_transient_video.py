@@ -210,22 +210,6 @@ def test_far_things_stand_out_and_near_ones_leave_no_trail():
     assert along[start] < 0.5 * along.max()
 
 
-def test_what_moves_far_away_is_as_bright_as_in_the_newest_capture_and_leaves_no_trail():
-    places = np.linspace(-0.4, 0.4, CAPTURES)
-    wall, random = planar_wall(12, 12) * [1 / 1.2, 1, 1], np.random.default_rng(0)
-    plan = LONG_WAVES.plan(see_moving(0.0), DEEP)
-    average = DepthAverage(DEEP, 0.0, CAPTURES)
-    for place in places:
-        capture = see([[place, 0.1, 1.3]], wall, [0.0, 0.0, 0.0], FAR_AXIS, 60e-12, [1.0])
-        noise = 0.05 * capture.signal.max() * random.standard_normal(capture.signal.shape)
-        field = plan.field(replace(capture, signal=capture.signal + noise))
-        averaged = average.add(field).values
-    here, there = (DEEP.find_nearest((x, 0.1, 1.3)) for x in places[[-1, 0]])
-    # A mean of all captures has a third of it at the newest place, and as much at the first.
-    assert averaged[here] > 0.9 * np.abs(field.values[here])
-    assert averaged[there] < 0.3 * averaged[here]
-
-
 def test_the_nearest_depths_show_the_newest_capture_alone():
     grid = Grid([0.0, 0.1], [0.0], [0.1, 0.5, 1.0])
     average = DepthAverage(grid, 0.0, 4)

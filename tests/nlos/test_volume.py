@@ -243,14 +243,6 @@ def test_flat_dark_and_single_voxel_volumes_can_be_drawn(tmp_path):
         dark(grid).save_picture(tmp_path / "dark.png")
 
 
-def test_depths_one_voxel_apart_have_nearly_one_colour():
-    values = np.zeros((3, 3, 4))
-    values[1, :, :2] = values[2, :, 2:] = 1
-    figure = _draw_figure(Volume(values, Grid(GRID.x, GRID.y, [0.5, 0.6, 0.7])))
-    drawn = next(axes for axes in figure.axes if "depth" in axes.get_title()).images[0]
-    assert drawn.get_clim() == pytest.approx((0.25, 1.05))  # 8 voxels around 0.6 and 0.7 m
-
-
 # --- exports, opened by libraries that share no code with the writers
 
 

@@ -21,15 +21,12 @@ from tofclip.operators.cameras import (
     AshokCamera,
     BabacanCamera,
     CodedApertureCamera,
-    EvenAngleLineCamera,
-    LineCamera,
     MarwahCamera,
     MeasuredCamera,
     assign_evenly,
     assign_randomly,
     count_lines,
 )
-from tofclip.operators.codes import make_sheared_mask
 from tofclip.operators.convolution import (
     CodedAperture,
     CubicPhasePlate,
@@ -312,14 +309,6 @@ def test_neighbouring_angles_stand_for_the_whole_aperture(count, cycle):
     assert max(evenly) < 0.25 * min(randomly)
 
 
-def test_the_even_camera_measures_as_much_as_the_random_one():
-    for ratio in (0.25, 1.0, 2.0):
-        cameras = [kind((32, 32), GRID, ratio, 0) for kind in (LineCamera, EvenAngleLineCamera)]
-        assert cameras[0].measurements == cameras[1].measurements
-        angles = (np.sort(np.concatenate(camera.angles)) for camera in cameras)
-        np.testing.assert_array_equal(*angles)
-
-
 MASKED_VIEWS = make_views(range(-1, 2), range(-2, 2))
 SMALL = (9, 11)
 LIGHT_FIELD = np.random.default_rng(0).random((len(MASKED_VIEWS), *SMALL)).astype(np.float32)
@@ -370,14 +359,6 @@ def test_marwah_s_mask_is_the_same_for_all_views_but_moved():
     assert 0 <= codes.min() < codes.max() <= 1
     with pytest.raises(InputError, match="one exposure, not 2"):
         MarwahCamera(SMALL, MASKED_VIEWS, 2, 0)
-
-
-def test_no_view_looks_past_the_edge_of_the_mask():
-    """Beyond it all would be dark, and random transmissions never are; far views look furthest."""
-    views = [(v, u) for v in (-4.0, 4.0) for u in (-4.0, 4.0)]
-    codes = make_sheared_mask((9, 11), views, 1.6, np.random.default_rng(0))
-    assert codes.shape == (4, 9, 11)
-    assert codes.min() > 0
 
 
 @every_camera

@@ -281,12 +281,6 @@ def test_what_does_not_fit_at_once_is_gathered_in_pieces(rows_at_once, monkeypat
     np.testing.assert_allclose(to_numpy(product(STRICT.put(BLOCK))), MATRIX @ BLOCK, rtol=1e-13)
 
 
-def test_a_matrix_without_entries():
-    empty = scipy.sparse.csr_array((3, 17), dtype=np.float32)
-    result = to_numpy(make_product(empty, STRICT)(STRICT.put(BLOCK.astype(np.float32))))
-    np.testing.assert_array_equal(result, np.zeros((3, 6)))
-
-
 def test_cupys_matrix_is_built_as_scipys_would_be(monkeypatch):
     """Where there is no CuPy, SciPy stands in for its sparse matrices, which have the same
     interface.

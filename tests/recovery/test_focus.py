@@ -11,7 +11,7 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from tofclip import Frames, depth, nmse, point_cloud
-from tofclip.camera import Camera, Measurement, SkewSweep, measure
+from tofclip.camera import Camera, SkewSweep, measure
 from tofclip.errors import CalibrationError, InputError, ShapeError
 from tofclip.lidar import Detection
 from tofclip.recovery import (
@@ -23,8 +23,6 @@ from tofclip.recovery import (
     parse_focus,
     recover,
 )
-from tofclip.recovery.focus import FrameSegment
-from tofclip.recovery.plan import recover_segments
 from tofclip.simulate import (
     Instrument,
     Scene,
@@ -36,7 +34,7 @@ from tofclip.simulate import (
 )
 from tofclip.simulate.demo import FOCAL_LENGTH_PX
 from tofclip.simulate.patterns import TEXELS, cut_pattern, make_letter, make_plain_pattern
-from tofclip.solvers import Backprojection, Sparse, TotalVariation
+from tofclip.solvers import Backprojection, Sparse
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN = 20e-12
@@ -210,23 +208,6 @@ def test_what_the_camera_does_not_know_is_said(shot):
         fit_parallax_to_shot(open_shot(shot.streak, shot.camera, time_zero=1e-9), 5, (-1.0, 1.0, 3))
     with pytest.raises(InputError, match="gates"):
         fit_parallax_to_shot(open_shot(shot.streak, shot.camera), 2, (-1.0, 1.0, 3))
-
-
-@pytest.mark.parametrize("method", [Sparse(1e-2, 30, gap=0.0), TotalVariation(1e-2, 30, gap=0.0)])
-def test_pieces_weigh_a_prior_as_the_whole_shot_does(method):
-    """A weight is relative to the brightest frame of what a solver is given; a piece has another."""
-    camera = Camera([16.0, 40.0, 64.0], [-0.6, 0.1, 0.7], (12, 12), 80)
-    pictures = np.random.default_rng(0).random((12, 12, 10)) ** 4
-    pictures[..., :5] *= 30
-    values = camera.operator(0.3)(pictures.astype(np.float32))
-    measurement = Measurement(values, np.ones(values.shape, bool))
-    whole, parts = (
-        recover_segments(method, camera, measurement, [FrameSegment(one, 0.3) for one in pieces])
-        for pieces in ([slice(0, 10)], [slice(0, 5), slice(5, 10)])
-    )
-    np.testing.assert_allclose(parts.frames, whole.frames, atol=1e-4 * whole.frames.max())
-    dim = whole.frames[5:]
-    np.testing.assert_allclose(parts.frames[5:], dim, atol=1e-2 * dim.max())
 
 
 WALL_DEPTH_M = 2.8

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from odd_jobs import die, meet, refuse, squares, stumble
+from odd_jobs import die, refuse, squares, stumble
 
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, StorageError
 from tofclip.files import MAX_HASHED_BYTES
@@ -59,14 +59,6 @@ def test_workers_do_what_is_done_here_however_many_jobs_there_are(scheduler, tmp
     assert (summary.done, summary.failures) == (MANY, ())
     assert contents(there) == contents(here)
     assert run_jobs([], scheduler).done == 0
-
-
-def test_the_processes_that_took_part_are_counted(scheduler, tmp_path):
-    """Two jobs that wait for each other need two processes, however busy the machine is."""
-    one, other = tmp_path / "one.txt", tmp_path / "other.txt"
-    jobs = [Job(a.stem, a, partial(meet, a, b)) for a, b in ((one, other), (other, one))]
-    summary = run_jobs(jobs, scheduler)
-    assert (summary.done, summary.failures, summary.processes) == (2, (), 2)
 
 
 def test_a_killed_worker_costs_at_most_the_job_that_kills_every_one(scheduler, tmp_path):

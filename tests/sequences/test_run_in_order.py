@@ -40,24 +40,6 @@ def stream_threads():
     return [thread for thread in threading.enumerate() if thread.name.startswith("stream ")]
 
 
-def test_values_are_worked_on_in_order(worker):
-    items = list(run_in_order(range(20), lambda value: str(2 * value), worker, 2))
-    assert [item.value for item in items] == [str(2 * number) for number in range(20)]
-    assert [item.number for item in items] == list(range(20))
-
-
-def test_work_overlaps_and_its_latency_is_measured():
-    both = threading.Barrier(2)
-
-    def meet(_):
-        both.wait(30)  # passes only while the other worker is at work as well
-        slow(0)
-
-    with ThreadPoolExecutor(2) as workers:
-        items = list(run_in_order(range(8), meet, workers, 2))
-    assert all(item.latency >= STEP for item in items)
-
-
 def test_a_slow_consumer_holds_the_source_back(worker):
     brought = []
     stream = run_in_order(count(50, begun=brought.append), keep, worker, at_once=2, queue_size=2)
@@ -93,32 +75,6 @@ def test_a_slow_consumer_gets_the_newest_where_that_is_wanted():
     assert items[-1].number == 39
     # what comes next was read while the consumer was busy with the one before
     assert sorted(item.latency for item in items)[len(items) // 2] < 2.5 * STEP
-
-
-def test_results_that_nobody_took_make_room_for_others():
-    """After a consumer was slow, as many things as before are worked on at once."""
-    together, waited = threading.Barrier(3), threading.Event()
-    done = []
-
-    def source():
-        yield from range(6)
-        waited.wait(30)
-        yield from (100, 101, 102)
-
-    def work(value):
-        if value >= 100:
-            together.wait(10)  # passes only where all three are at work
-        done.append(value)
-        return value
-
-    with ThreadPoolExecutor(3) as workers:
-        stream = run_in_order(source(), work, workers, 3, queue_size=9, policy="drop_oldest")
-        next(stream)
-        while len(done) < 4:
-            sleep(STEP / 5)
-        assert next(stream).number >= 3  # the newest of those that were done meanwhile
-        waited.set()
-        assert [item.value for item in stream][-1] == 102
 
 
 def test_few_things_are_alive(worker):

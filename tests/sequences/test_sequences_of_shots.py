@@ -11,7 +11,7 @@ import pytest
 from odd_jobs import on_a_full_disk
 
 from tofclip import Frames
-from tofclip.camera import Camera, measure
+from tofclip.camera import Camera
 from tofclip.errors import InputError, StorageError
 from tofclip.lidar import PointCloud
 from tofclip.sequences import (
@@ -25,7 +25,6 @@ from tofclip.sequences import (
 )
 from tofclip.sequences.cache import CachedInverse, get_cached_camera
 from tofclip.sequences.jobs import run_jobs, select_unfinished
-from tofclip.solvers import LinearInverse
 from tofclip.storage import Record
 
 pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them
@@ -215,13 +214,3 @@ def test_operators_and_inverses_are_kept_by_content(camera):
     assert prepare(0.0) is not inverses[0]  # 16 are kept, the first two had to go
     made = [weakref.ref(one.operator(shear)) for shear in np.linspace(1.1, 2, 40)]
     assert sum(operator() is not None for operator in made) == 32
-
-
-def test_kept_inverses_are_those_of_the_method(camera, streaks):
-    measured = measure(streaks[0].counts, streaks[0].saturated, camera)
-    method, operator = LinearInverse(), camera.operator()
-    keeping, seen = CachedInverse(method.damping), (operator, measured.values, measured.valid)
-    expected = method.recover(*seen).frames
-    for _ in range(2):
-        np.testing.assert_array_equal(keeping.recover(*seen).frames, expected)
-    assert repr(keeping) == repr(method)

@@ -177,58 +177,6 @@ def test_tolerance_stops_and_says_so():
     assert done.objective[-1] < limited.objective[-1]
 
 
-class _Scripted:
-    """A solver whose objectives, and whether a step was refused, are given beforehand."""
-
-    def __init__(self, *steps):
-        self._steps = list(steps)
-        self.objective, self.rejected = np.array([10.0]), np.array([False])
-
-    def duality_gap(self):
-        raise AssertionError("nobody asked for the gap")
-
-    def step(self):
-        value, refused = self._steps.pop(0)
-        self.objective, self.rejected = np.array([value]), np.array([refused])
-
-
-def test_a_refused_step_is_not_convergence():
-    """The objective stands still because the step was undone, not because it is the least."""
-    solver = _Scripted((9.0, False), (9.0, True), (7.0, False), (7.0, False), (1.0, False))
-    history = iterate(solver, StoppingRule(5, 1e-3), ignore_progress, 1)
-    assert history.converged
-    assert history.objective.tolist() == [10, 9, 9, 7, 7]
-
-
-def test_after_a_refused_step_the_momentum_starts_anew():
-    """The first step from there is a plain one, the second has the second momentum of all runs, and
-    both the size that the solver says.
-    """
-    operator, measurements, checked = projection(), noise(3, LANES), 0
-    solver = begin(LeastSquares(measurements), NonnegativeSparsity(1e-3))
-    for _ in range(200):
-        solver.step()
-        fresh = solver.rejected.copy()
-        age, size_before = np.ones(LANES), solver.step_sizes
-        for number in range(2):
-            if not fresh.any():
-                break
-            size = solver.step_sizes
-            # the first step's momentum is 0; the next one's follows the ratio of the steps
-            older, age = age, (1 + np.sqrt(1 + 4 * size_before / size * age**2)) / 2
-            momentum = (older - 1) / age
-            ahead = solver.current + momentum * (solver.current - solver.previous)
-            gradient = operator.adjoint(operator(ahead) - measurements)
-            expected = np.maximum(ahead - size * (gradient + 1e-3), 0)
-            size_before = size
-            solver.step()
-            fresh &= ~solver.rejected
-            difference = np.abs(solver.current - expected)[..., fresh]
-            assert np.all(difference <= 1e-9 * np.abs(expected).max())
-            checked += np.count_nonzero(fresh) if number else 0
-    assert checked > 0
-
-
 def test_steps_grow_as_far_as_they_are_safe_and_save_iterations():
     """Two thirds of the iterations of steps of one size lead to the same objective."""
     measurements = projection()(PICTURE)
@@ -443,17 +391,6 @@ def test_a_step_between_views_shrinks_from_both_sides(axis):
     known = np.where(noisy == 1, 1 + 0.4 * 0.5 / 2, 3 - 0.4 * 0.5 / 2)
     np.testing.assert_allclose(found, known, atol=1e-5)
     assert penalty[0] == pytest.approx(0.4 * 0.5 * (2 - 0.2) * 4 * 9, rel=1e-4)
-
-
-def test_lanes_of_light_fields_do_not_mix_and_what_does_not_fit_is_refused():
-    views = np.random.default_rng(1).random((4, 7, 6, 2))
-    both, _ = denoise(NonnegativeLightFieldVariation(0.1, (2, 2), 0.7), views, 50)
-    one, _ = denoise(NonnegativeLightFieldVariation(0.1, (2, 2), 0.7), views[..., :1].copy(), 50)
-    np.testing.assert_allclose(both[..., :1], one, atol=1e-12)
-    with pytest.raises(InputError, match="angular"):
-        NonnegativeLightFieldVariation(0.1, (2, 2), -1)
-    with pytest.raises(ShapeError, match="views"):
-        denoise(NonnegativeLightFieldVariation(0.1, (2, 3), 1), views, 1)
 
 
 def test_wavelets_shrink_noise_and_no_slope():

@@ -28,11 +28,10 @@ from tofclip.solvers import (
     relative_residual,
 )
 from tofclip.solvers.data_terms import estimate_robust_deviation
-from tofclip.solvers.direct import PATCH_COLUMNS, PATCH_ROWS, InverseTraces, order_by_patch
+from tofclip.solvers.direct import InverseTraces, order_by_patch
 from tofclip.solvers.fista import (
     FOLD_COUNT,
     MAX_WEIGHT_WORK,
-    SINGLE_FOLD_RUNS,
     assign_folds,
     choose_weight,
 )
@@ -298,13 +297,6 @@ def test_traces_are_the_pictures_seen_pixel_by_pixel(prepared, frames):
     assert np.all(found[:, [0, -1]] == -1)
 
 
-def test_patches_hold_every_pixel_once_and_neighbours_together():
-    order = order_by_patch((21, 37))
-    np.testing.assert_array_equal(np.sort(order), np.arange(21 * 37))
-    row, column = np.divmod(order[: PATCH_ROWS * PATCH_COLUMNS], 37)
-    assert (row.max(), column.max()) == (PATCH_ROWS - 1, PATCH_COLUMNS - 1)
-
-
 @given(count=st.integers(2, 3000), run=st.integers(1, 200), seed=st.integers(0, 9))
 def test_every_reading_is_left_out_once(count, run, seed):
     out = assign_folds(count, run, seed)
@@ -314,13 +306,6 @@ def test_every_reading_is_left_out_once(count, run, seed):
         np.testing.assert_array_equal(out.sum(axis=1), 1)
     else:
         assert 0.05 < out.mean() < 0.25  # one of eight folds, of many runs
-
-
-def test_neighbours_are_left_out_together_and_many_runs_need_one_fold_only():
-    out = assign_folds(16 * 20, 20, 3).reshape(16, 20, FOLD_COUNT)
-    np.testing.assert_array_equal(out.all(axis=1), out.any(axis=1))
-    assert assign_folds(SINGLE_FOLD_RUNS, 1, 0).shape[1] == 1
-    assert assign_folds(SINGLE_FOLD_RUNS - 1, 1, 0).shape[1] == FOLD_COUNT
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.1])

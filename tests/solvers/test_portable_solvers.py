@@ -22,11 +22,8 @@ from tofclip.solvers import (
     PlugAndPlay,
     Poisson,
     Sparse,
-    StoppingRule,
     TotalVariation,
     Wavelets,
-    ignore_progress,
-    iterate,
     methods,
     relative_residual,
 )
@@ -100,13 +97,6 @@ def test_pieces_make_no_difference(device, method, monkeypatch):
     assert difference(found, whole) < ROUNDING[np.float32]
 
 
-def test_an_inverse_is_prepared_once_for_all_arrays(device):
-    measurements, _ = letters(40)
-    prepared = LinearInverse().prepare(projection())
-    found = to_numpy(prepared.recover(device.put(measurements)).frames)
-    assert difference(found, prepared.recover(measurements).frames) < 1e-5
-
-
 @pytest.mark.parametrize("prior", [Sparse, TotalVariation])
 @pytest.mark.parametrize(
     "data_term",
@@ -159,42 +149,6 @@ def test_no_step_waits_for_the_device(prior, monkeypatch):
         float(strict.sum(solver.objective))
     for _ in range(3):
         solver.step()
-
-
-def test_a_tolerance_waits_for_the_device_once_in_an_iteration(monkeypatch):
-    pytest.importorskip("array_api_strict")
-    measurements = ComputeDevice("array_api_strict").put(letters(3)[0])
-    solver = begin(measurements, NonnegativeSparsity(0.5))
-    kind, asked = type(measurements), []
-    truth = kind.__bool__
-    monkeypatch.setattr(kind, "__bool__", lambda array: bool(asked.append(array)) or truth(array))
-    history = iterate(solver, StoppingRule(7, 1e-9), ignore_progress, 3)
-    assert len(asked) == history.iterations == 7
-
-
-@pytest.mark.parametrize("shape", [(7, 6, 3), (1, 9, 2), (8, 1, 1)], ids=str)
-@pytest.mark.parametrize("weight", [0.0, 0.3])
-@pytest.mark.parametrize("prior", [NonnegativeSparsity, NonnegativeTotalVariation])
-def test_proximal_steps_are_those_of_the_compiled_loops(device, prior, shape, weight):
-    rng = np.random.default_rng(3)
-    current, previous, gradient = rng.standard_normal((3, *shape))
-    momentum, step = rng.random((2, shape[-1]))
-    here, there = prior(weight), prior(weight)
-    for _ in range(3):
-        expected = here.proximal_step(current, previous.copy(), momentum, gradient.copy(), step)
-        given = (device.put(a) for a in (current, previous, momentum, gradient.copy(), step))
-        found = there.proximal_step(*given)
-        for one, other in zip(found, expected, strict=True):
-            if other is not None:
-                np.testing.assert_allclose(to_numpy(one), other, rtol=1e-12, atol=1e-13)
-    point = current + momentum * (current - previous)
-    if prior is NonnegativeSparsity:
-        picture = np.maximum(point - step * (gradient + weight), 0)
-        np.testing.assert_allclose(expected.picture, picture, rtol=1e-12, atol=1e-14)
-        np.testing.assert_allclose(expected.penalty, weight * picture.sum((0, 1)), rtol=1e-12)
-        np.testing.assert_allclose(
-            expected.distance, ((picture - point) ** 2).sum((0, 1)), rtol=1e-12
-        )
 
 
 def test_what_has_only_compiled_loops_says_so(device):
