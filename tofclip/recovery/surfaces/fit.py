@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
-from tofclip.lidar import Detection, compute_ray_directions, depth
+from tofclip.lidar import Detection, depth
 from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
 from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver, Tick
 from tofclip.recovery.surfaces.model import SurfaceModel
@@ -68,6 +68,9 @@ LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 3.5, 0.05, 3
 # deviation out of the noise that the whole shot shows, where there are few, and for each e-fold of the
 # odds that the frames alone give it. From scenes of known returns.
 OTHER_ODDS, ENOUGH_SIGMAS, LEAST_DOUBT = np.array([5.7, -0.56, 1.96]), 15.0, 1e-4
+# About such a return its range may have light as well: what is too dim to be a surface is seen at a few
+# of its pixels, which would have the light of all.
+ABOUT_OTHERS_PX = 1
 
 Places = tuple[NDArray[Any], NDArray[Any], FloatArray]
 
@@ -321,7 +324,8 @@ def _find_others(
     others = found[~near]
     if not len(others):
         return others, solver
-    together, own = _add_returns(solver, others, tick)
+    dark = np.zeros(len(others), np.float32)
+    together, own = _add_returns(solver, others, dark, 0, tick)
     weights = together.model.weights / together.estimate_local_variance()
     information = together.model.gather(weights, squared=True)[own]
     shown = np.minimum(together.amplitude[own] * np.sqrt(information), ENOUGH_SIGMAS)
@@ -329,35 +333,44 @@ def _find_others(
     known = [np.ones(shown.size), shown, scipy.special.logit(doubt)]
     doubt = scipy.special.expit(OTHER_ODDS @ np.array(known)).astype(np.float32)
     others = replace(others, false_alarm=doubt)
-    # Nothing ties a single pixel's light to that of others: drawn is what is expected of it where it may
-    # be false, or noise (W. James and C. Stein, Proc. 4th Berkeley Symp. 1, 361, 1961). The light of
-    # those that are not drawn, or dropped as all methods drop them, goes to the others.
+    # Drawn is what is expected of each where it may be false, or noise (W. James and C. Stein, Proc. 4th
+    # Berkeley Symp. 1, 361, 1961). The light of those that are not drawn, or dropped as all methods drop
+    # them, goes to the others; and what lies about them is not theirs alone.
     drawn = (doubt <= DEFAULT_FALSE_ALARM) & (shown > 1)
-    whole, own = _add_returns(solver, others[drawn], tick)
+    light = together.amplitude[own[drawn]]
+    whole, own = _add_returns(solver, others[drawn], light, ABOUT_OTHERS_PX, tick)
     whole.amplitude[own] *= (1 - doubt[drawn]) * (1 - 1 / shown[drawn] ** 2)
     return others[doubt < 0.5], whole
 
 
 def _add_returns(
-    solver: AmplitudeSolver, others: Returns, tick: Tick
+    solver: AmplitudeSolver, others: Returns, light: Image, margin_px: int, tick: Tick
 ) -> tuple[AmplitudeSolver, Pixels]:
-    """Solve for the light of surfaces and of returns beside them; also return the returns' points."""
+    """Solve for the light of surfaces and of returns beside them, which is `light` at first; also return
+    the returns' points. Light of a return's range may lie as many pixels about it.
+    """
     model, shape = solver.model, solver.model.camera.image_shape
     pixel = others.y.astype(np.intp) * shape[1] + others.x
     order, rank = rank_within_pixels(pixel, others.range)
     layer = np.empty_like(rank)
     layer[order] = rank
     masks = np.zeros((int(rank.max(initial=-1)) + 1, *shape), bool)
-    inverse = np.ones(masks.shape)
+    ranges = np.ones(masks.shape)
     place = layer, others.y, others.x
-    masks[place] = True
-    depths = compute_ray_directions(model.camera, others.y, others.x)[:, 2] * others.range
-    inverse[place] = 1 / depths
-    begin = np.concatenate([solver.amplitude, np.zeros(pixel.size, np.float32)])
+    masks[place], ranges[place] = True, others.range
+    about = np.ones((2 * margin_px + 1,) * 2)
+    for mask, distance in zip(masks, ranges, strict=True):
+        nearest = scipy.ndimage.distance_transform_edt(
+            ~mask, return_distances=False, return_indices=True
+        )
+        distance[...] = distance[tuple(nearest)]
+        mask[...] = scipy.ndimage.binary_dilation(mask, about)
+    point = model.surface.size + np.cumsum(masks).reshape(masks.shape)[place] - 1
+    begin = np.append(solver.amplitude, np.zeros(masks.sum(), np.float32))
+    begin[point] = light
+    inverse = measure_rays(model.camera) / ranges
     together = AmplitudeSolver(model.add(masks, inverse), begin, solver.weight)
     together.run(START_ITERATIONS, tick)
-    point = np.empty_like(pixel)
-    point[np.lexsort((pixel, layer))] = model.surface.size + np.arange(pixel.size)
     return together, point
 
 
