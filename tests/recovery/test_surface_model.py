@@ -108,7 +108,7 @@ def test_splines_are_a_quadratic_and_what_bends():
     """Cubic splines hold every quadratic, so that taking it apart and together changes nothing."""
     shape = (40, 50)
     basis = SmoothBasis(shape, (-3, 5, 30, 45), (3, 4))
-    coefficients, quadratic = basis.split_quadratic()
+    coefficients, quadratic = basis.quadratic_parts
     np.testing.assert_allclose(quadratic @ coefficients, np.eye(6), atol=1e-8)
     pixels = np.ravel_multi_index(np.mgrid[2:28, 8:40].reshape(2, -1), shape)
     monomials = evaluate_monomials(pixels, shape)
@@ -255,7 +255,7 @@ def test_light_is_placed_on_an_uneven_time_axis(shot):
     alone = np.zeros(model.surface.size, np.float32)
     alone[point] = 1
     seen = model.receive(3, alone, model.kernels[3])
-    light = seen.image.sum(axis=1)
+    light = seen.images.sum(axis=(0, 2))
     there = 2 * model.distance[point] / 299_792_458 + CAMERA.time_zero
     expected = np.interp(there, times, np.arange(times.size))
     assert seen.row + np.average(np.arange(light.size), weights=light) == pytest.approx(
@@ -273,7 +273,7 @@ def test_surfaces_that_run_off_take_no_more_memory(shot, inverse: float):
     away.coefficients[0][:] = 0
     away.coefficients[0][0] = inverse
     model.place(away)
-    assert max(one.columns for one in model.footprints) < 1.1 * model.image.shape[1]
+    assert max(one.shape[1] for one in model.footprints) < 1.1 * model.image.shape[1]
     seen = model.gather(np.ones_like(model.image))
     first, second = model.parts
     assert not seen[first].any()

@@ -178,18 +178,19 @@ class AmplitudeSolver:
 
         masks, found = self.model.masks, np.empty_like(amplitude)
 
-        def work(one: int) -> None:
-            rows, columns = self._boxes[one]
-            mask = np.ascontiguousarray(masks[one, rows, columns])
-            picture = np.zeros(mask.shape, np.float32)
-            picture[mask] = amplitude[self.model.parts[one]]
-            dual = np.ascontiguousarray(self._dual[one, :, rows, columns])
-            result = np.empty_like(picture)
-            prox_masked_tv(picture, mask, weights[one], PROX_ITERATIONS, dual, result)
-            self._dual[one, :, rows, columns] = dual
-            found[self.model.parts[one]] = result[mask]
+        def work(surfaces: range) -> None:
+            for one in surfaces:
+                rows, columns = self._boxes[one]
+                mask = np.ascontiguousarray(masks[one, rows, columns])
+                picture = np.zeros(mask.shape, np.float32)
+                picture[mask] = amplitude[self.model.parts[one]]
+                dual = np.ascontiguousarray(self._dual[one, :, rows, columns])
+                result = np.empty_like(picture)
+                prox_masked_tv(picture, mask, weights[one], PROX_ITERATIONS, dual, result)
+                self._dual[one, :, rows, columns] = dual
+                found[self.model.parts[one]] = result[mask]
 
-        self.model.map_parallel(work, len(masks))
+        self.model.share_out(work, len(masks))
         return found
 
 

@@ -15,13 +15,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.compiling import compile_loop
+from tofclip.compiling import ONE, compile_loop
 
 Image = NDArray[np.float32]
 
 fast_loop = compile_loop(fastmath=True)
 
 SPLINE_SAMPLES = 3
+TWO, THREE = np.uintp(2), np.uintp(3)
 LEAST_SPREAD = 1e-3  # px, of a view whose lines are upright
 
 
@@ -61,72 +62,86 @@ def split_over_slit(position, width, height, tangent, first, shares):
 
 
 @fast_loop
-def add_light(light, starts, row, row_shares, column, slit_shares, above, before, image):
-    """Add the light of surface points, so much from each of a point's places, to the image of a view; all
-    of it must fall inside. `starts` (points + 1,): first place of each; `row, column` (places,): first of
-    those that a place reaches, shares there (places, 3) and (places, 4); `above, before`: the image's
-    first ones.
+def add_light(lights, shares, starts, row, row_shares, column, slit_shares, above, before, images):
+    """Add the light of surface points, (n, points), to n images of a view, (n, rows, columns); all of it
+    must fall inside. `shares` (points,): what each of a point's places has of it; `starts` (points + 1,):
+    first place of each; `row, column` (places,): first of those that a place reaches, shares there
+    (places, 3) and (places, 4); `above, before`: the images' first ones.
     """
-    for point in range(light.size):
-        # most points of a volume are dark
-        if light[point] == 0:
-            continue
-        for place in range(starts[point], starts[point + 1]):
-            top, left = row[place] - above, column[place] - before
-            for i in range(3):
-                instant = light[point] * row_shares[place, i]
-                for j in range(4):
-                    image[top + i, left + j] += instant * slit_shares[place, j]
+    for number in range(lights.shape[0]):
+        image, own = images[number], lights[number]
+        for point in range(own.size):
+            # most points of a volume are dark
+            if own[point] == 0:
+                continue
+            light = own[point] * shares[point]
+            for place in range(starts[point], starts[point + 1]):
+                # without a sign, for which an index would be looked at whether it counts from the end
+                top, left = np.uintp(row[place] - above), np.uintp(column[place] - before)
+                a, b = slit_shares[place, 0], slit_shares[place, 1]
+                c, d = slit_shares[place, 2], slit_shares[place, 3]
+                for i in range(np.uintp(SPLINE_SAMPLES)):
+                    line, instant = image[top + i], light * row_shares[place, i]
+                    # read before any is written: for all that the compiler knows they overlap
+                    e, f = line[left] + instant * a, line[left + ONE] + instant * b
+                    g, h = line[left + TWO] + instant * c, line[left + THREE] + instant * d
+                    line[left], line[left + ONE], line[left + TWO], line[left + THREE] = e, f, g, h
 
 
 @fast_loop
-def gather_light(image, gain, point, row, row_shares, column, slit_shares, above, amplitude):
-    """The adjoint of `add_light`, but for the points' shares: what places would find in an image of all
-    columns is added up for the `point` (places,) of each. A loop over points, each with its places,
-    takes half as long again.
+def gather_light(images, shares, point, row, row_shares, column, slit_shares, lights):
+    """The adjoint of `add_light`: what places find in images of all rows and columns is added up for the
+    `point` (places,) of each. A loop over points, each with its places, takes half as long again.
     """
-    for place in range(point.size):
-        top, left = row[place] - above, column[place]
-        total = 0.0
-        for i in range(3):
-            instant = 0.0
-            for j in range(4):
-                instant += slit_shares[place, j] * image[top + i, left + j]
-            total += row_shares[place, i] * instant
-        amplitude[point[place]] += gain * total
+    for number in range(images.shape[0]):
+        image, own = images[number], lights[number]
+        for place in range(point.size):
+            top, left = np.uintp(row[place]), np.uintp(column[place])
+            a, b = slit_shares[place, 0], slit_shares[place, 1]
+            c, d = slit_shares[place, 2], slit_shares[place, 3]
+            total = np.float32(0)
+            for i in range(np.uintp(SPLINE_SAMPLES)):
+                line = image[top + i]
+                instant = a * line[left] + b * line[left + ONE]
+                instant += c * line[left + TWO] + d * line[left + THREE]
+                total += row_shares[place, i] * instant
+            own[point[place]] += shares[point[place]] * total
 
 
 @fast_loop
-def smooth_rows(image, kernel, lags, rows, margin, result):
-    """Add up the rows of an image that lie `lags` before each row, weighted by a kernel, for some of the
-    result's rows, of which row 0 is row `margin` of the image; what lies outside the image counts as
-    dark. Lags increase or decrease.
+def smooth_rows(images, kernel, lags, rows, below, aside, results):
+    """Add to some rows of results, (n, rows, columns), the rows of images that lie `lags` before each,
+    weighted by a kernel. Row and column 0 of the results are `below` and `aside` of the images; what
+    lies outside these counts as dark. Lags increase or decrease.
     """
-    taps, height = kernel.size, image.shape[0]
-    for number in range(rows.size):
-        target = rows[number]
-        line, source = result[target], target + margin
-        for i in range(line.size):
-            line[i] = 0
-        tap, end = 0, taps
-        while tap < end and not (kernel[tap] != 0 and 0 <= source - lags[tap] < height):
-            tap += 1
-        while end > tap and not (kernel[end - 1] != 0 and 0 <= source - lags[end - 1] < height):
-            end -= 1
-        # Four rows at a time, as whole lines: the sums stay in registers, and an index into two
-        # dimensions would be checked for every pixel.
-        while tap + 4 <= end:
-            a, b, c, d = kernel[tap], kernel[tap + 1], kernel[tap + 2], kernel[tap + 3]
-            line_a, line_b = image[source - lags[tap]], image[source - lags[tap + 1]]
-            line_c, line_d = image[source - lags[tap + 2]], image[source - lags[tap + 3]]
-            for i in range(line.size):
-                line[i] += a * line_a[i] + b * line_b[i] + c * line_c[i] + d * line_d[i]
-            tap += 4
-        while tap < end:
-            weight, other = kernel[tap], image[source - lags[tap]]
-            for i in range(line.size):
-                line[i] += weight * other[i]
-            tap += 1
+    taps, height = kernel.size, images.shape[1]
+    left, right = max(-aside, 0), min(results.shape[2], images.shape[2] - aside)
+    for number in range(images.shape[0]):
+        image = images[number]
+        for target in rows:
+            source = target + below
+            line = results[number, target, left:right]
+            tap, end = 0, taps
+            while tap < end and not (kernel[tap] != 0 and 0 <= source - lags[tap] < height):
+                tap += 1
+            while end > tap and not (kernel[end - 1] != 0 and 0 <= source - lags[end - 1] < height):
+                end -= 1
+            # Four rows at a time, as whole lines: the sums stay in registers, and an index into two
+            # dimensions would be checked for every pixel.
+            while tap + 4 <= end:
+                a, b, c, d = kernel[tap], kernel[tap + 1], kernel[tap + 2], kernel[tap + 3]
+                line_a = image[source - lags[tap], left + aside :]
+                line_b = image[source - lags[tap + 1], left + aside :]
+                line_c = image[source - lags[tap + 2], left + aside :]
+                line_d = image[source - lags[tap + 3], left + aside :]
+                for i in range(line.size):
+                    line[i] += a * line_a[i] + b * line_b[i] + c * line_c[i] + d * line_d[i]
+                tap += 4
+            while tap < end:
+                weight, other = kernel[tap], image[source - lags[tap], left + aside :]
+                for i in range(line.size):
+                    line[i] += weight * other[i]
+                tap += 1
 
 
 def prox_masked_tv(

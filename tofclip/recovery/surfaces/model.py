@@ -19,6 +19,7 @@ import copy
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial, reduce
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -43,6 +44,7 @@ from tofclip.threads import map_parallel, split_blocks, thread_count
 from tofclip.units import SPEED_OF_LIGHT
 
 Result = TypeVar("Result")
+Box = tuple[slice, slice]
 
 MODEL_ERROR_FRACTION = 0.015  # of the brightest measurement: what the model leaves without noise
 SMOOTHING_PX = 2.0
@@ -187,34 +189,35 @@ class Places(NamedTuple):
 
 
 class Footprint(NamedTuple):
-    """The rows and columns of a view on which points have light, and in which fractions. Rows count
-    from the first whose afterglow reaches the streak image, columns from `first_column`.
+    """The rows and columns of a view on which points have light, and in which fractions: those of a
+    picture of its own, of what light reaches, with dark rows before and behind.
     """
 
     row: NDArray[np.int32]  # (places,), first of those that a part of a pixel reaches
     row_shares: Image  # (places, 3), before the pulse smooths them
     column: NDArray[np.int32]  # (places,), first of those that a part reaches
     slit_shares: Image  # (places, 4)
+    shape: tuple[int, int]  # of the view's picture
+    first_row: int  # of it, as rows count from the first whose afterglow reaches the streak image
     first_column: int  # of the slit, of which the view has a part
-    columns: int
-    lit_rows: NDArray[np.int64]  # (n,), which smoothed light reaches
-    reached_rows: NDArray[np.int64]  # (n,), before it is smoothed; from `margin` above the first on
+    lit_rows: NDArray[np.int64]  # (n,), which smoothed light reaches; none where the view is dark
+    reached_rows: NDArray[np.int64]  # (n,), before it is smoothed
     between: BetweenCentres  # of the points
     height: FloatArray  # (points,), see `measure_height`
     rows_per_instant: float  # raw rows in the time of one, on average
 
 
 class Window(NamedTuple):
-    """A part of the streak image."""
+    """A part of streak images."""
 
     row: int  # of its corner
     column: int
-    image: Image
+    images: Image  # (n, rows, columns)
 
     @property
     def area(self) -> tuple[slice, slice]:
         """Where it lies."""
-        rows, columns = self.image.shape
+        _, rows, columns = self.images.shape
         return slice(self.row, self.row + rows), slice(self.column, self.column + columns)
 
 
@@ -310,13 +313,17 @@ class SurfaceModel:
         self.excess = np.clip(np.outer(self.camera.view_positions, left), -1, 1)
         self.half = int(np.ceil(EXTENT_SIGMAS * MAX_LENGTHENING * self.pulse.sigma)) + 1
         self._margin = self.half + 3
+        self._lags = np.arange(-self.half, self.half + 1)
         # rows before and behind the streak image whose light reaches it later or earlier
         self.before = int(max(self.pulse.lags.max(), 0))
         self._rows = self.before + self.image.shape[0] + int(max(-self.pulse.lags.min(), 0))
-        self.footprints = self.map_parallel(self._spread_view, self.camera.views)
+        spread = self.share_out(
+            lambda views: [self._spread_view(view) for view in views], self.camera.views
+        )
+        self.footprints = list(itertools.chain.from_iterable(spread))
         self.kernels = [self.make_kernel(view) for view in range(self.camera.views)]
         # rows that light of any view reaches, as those of `Footprint` count, and of the streak image
-        rows = np.concatenate([place.lit_rows for place in self.footprints])
+        rows = np.concatenate([place.first_row + place.lit_rows for place in self.footprints])
         last = int(rows.max(initial=-1)) + 1
         self._lit_before = slice(int(rows.min(initial=last)), last)
         first = self._lit_before.start - self.before + int(self.pulse.lags.min())
@@ -373,10 +380,14 @@ class SurfaceModel:
         hit = np.bincount(first + margin, minlength=rows + 2 * margin)
         reached = np.convolve(hit, np.ones(samples))[: hit.size] > 0
         lit = np.convolve(reached, np.ones(2 * self.half + 1), "same")[margin:-margin] > 0
+        lines = np.flatnonzero(lit)
+        top = int(lines.min(initial=rows)) - margin
+        high = int(lines.max()) + margin + 1 - top if lines.size else 0
+        first -= np.int32(top)
         slit_first -= np.int32(left)
-        lines = np.flatnonzero(lit), np.flatnonzero(reached)
-        light = first, shares, slit_first, slit, left, wide
-        return Footprint(*light, *lines, between, height, pace)
+        light = first, shares, slit_first, slit, (high, wide), top, left
+        reached_rows = np.flatnonzero(reached) - margin - top
+        return Footprint(*light, lines - top, reached_rows, between, height, pace)
 
     def _locate(self, view: int) -> tuple[FloatArray, FloatArray, BetweenCentres, float]:
         """Where parts of points fall in a view, (places,): row and column of the raw streak image,
@@ -471,7 +482,7 @@ class SurfaceModel:
     def estimate_deviation(self, covariances: Sequence[FloatArray]) -> FloatArray:
         """Standard deviations of all ranges, (points,), by covariances of surfaces' coefficients."""
         known = zip(self.derivatives, covariances, strict=True)
-        variance = np.concatenate([np.einsum("pi,ij,pj->p", m, c, m) for m, c in known])
+        variance = np.concatenate([np.sum((m @ c) * m, axis=1) for m, c in known])
         # range = length / inverse depth
         return np.asarray(self.distance**2 / self.ray_length * np.sqrt(variance))
 
@@ -491,76 +502,87 @@ class SurfaceModel:
         apart = np.maximum((before != own).astype(int) + (behind != own), 1)
         return np.asarray((self.distance[behind] - self.distance[before]) / apart)
 
-    def map_parallel(self, work: Callable[[int], Result], jobs: int) -> list[Result]:
-        """Return ``work(job)`` of all views or surfaces; each thread takes its share of them at once."""
-        if self.surface.size < PARALLEL_POINTS:
-            return [work(job) for job in range(jobs)]
-        shares = split_blocks(jobs, -(-jobs // thread_count()))
-        found = map_parallel(lambda share: [work(job) for job in range(jobs)[share]], shares)
-        return [one for part in found for one in part]
+    def share_out(self, work: Callable[[range], Result], jobs: int) -> list[Result]:
+        """Return ``work(share)`` of each thread's share of all views or surfaces."""
+        threads = 1 if self.surface.size < PARALLEL_POINTS else thread_count()
+        shares = [range(jobs)[own] for own in split_blocks(jobs, -(-jobs // threads))]
+        return list(map_parallel(work, shares))
 
     def receive(
         self, view: int, amplitude: Image, kernel: Image, part: slice = slice(None)
     ) -> Window:
-        """Return what the streak image receives of some points by a view of gain 1. `amplitude`: of
-        the points in `part`; `kernel` (taps,): of the pulse's core.
+        """Return what streak images receive of some points by a view. `amplitude`: of the points in
+        `part`, (points,), or for each of n images (n, points); `kernel` (taps,): of the pulse's core.
         """
-        top, slit, light = self._project(view, amplitude, kernel, part)
-        first = max(top - self.before + int(self.pulse.lags.min()), 0)
-        last = top + len(light) - self.before + int(self.pulse.lags.max())
-        last = max(min(last, self.image.shape[0]), first)
-        return Window(
-            first, slit.start, self._trail(light, first + self.before - top, last - first)
+        lights, place = np.atleast_2d(amplitude), self.footprints[view]
+        rows, columns = box = self._find_box(view, part)
+        top, bottom = place.first_row + rows.start, place.first_row + rows.stop
+        left, right = (
+            min(max(place.first_column + one, 0), self.image.shape[1])
+            for one in (columns.start, columns.stop)
         )
+        light = np.zeros((len(lights), bottom - top, right - left), np.float32)
+        self._project(view, lights, kernel, part, box, (top, left), light)
+        first = max(top - self.before + int(self.pulse.lags.min()), 0)
+        last = min(bottom - self.before + int(self.pulse.lags.max()), self.image.shape[0])
+        return Window(first, left, self._trail(light, first + self.before - top, last - first))
+
+    def _find_box(self, view: int, part: slice) -> Box:
+        """Rows and columns of a view's picture that the light of some points reaches."""
+        from tofclip.recovery.surfaces.kernels import SPLINE_SAMPLES
+
+        place, margin = self.footprints[view], self._margin
+        begin, end, _ = part.indices(self.surface.size)
+        own = slice(int(self.places.starts[begin]), int(self.places.starts[end]))
+        row, column = place.row[own], place.column[own]
+        if not (row.size and place.lit_rows.size):
+            return slice(0, 0), slice(0, 0)
+        first = max(int(row.min()) - self.half, margin)
+        last = min(int(row.max()) + SPLINE_SAMPLES + self.half, place.shape[0] - margin)
+        left, right = int(column.min()), int(column.max()) + SLIT_PIXELS
+        return slice(first, max(last, first)), slice(left, right)
 
     def _project(
-        self, view: int, amplitude: Image, kernel: Image, part: slice
-    ) -> tuple[int, slice, Image]:
-        """What a view of gain 1 sees of some points without their afterglow: the first row, as rows of
-        `Footprint` count, the columns of the slit, and (rows, columns) there.
+        self,
+        view: int,
+        lights: Image,
+        kernel: Image,
+        part: slice,
+        box: Box,
+        corner: tuple[int, int],
+        images: Image,
+    ) -> None:
+        """Add what a view sees of some points, (n, points), without their afterglow, to n images.
+        `box`: that they reach; `corner`: the images' first row, as those of `Footprint` count, and column.
         """
         from tofclip.recovery.surfaces.kernels import add_light, smooth_rows
 
-        place, margin, samples = self.footprints[view], self._margin, 3
-        amplitude, lit = self.shade(view, amplitude, part), place.lit_rows
-        if not (amplitude.size and lit.size):
-            return 0, slice(0, 0), np.zeros((0, 0), np.float32)
-        first, last, left, right = int(lit[0]), int(lit[-1]) + 1, 0, place.columns
+        place, (rows, columns), margin = self.footprints[view], box, self._margin
+        if rows.start == rows.stop:
+            return
+        top, left = rows.start - margin, columns.start
+        size = rows.stop + margin - top, columns.stop - left
+        light = np.zeros((len(lights), *size), np.float32)
         begin, end, _ = part.indices(self.surface.size)
-        starts = self.places.starts[begin : end + 1]
-        if part != slice(None):
-            own = slice(int(starts[0]), int(starts[-1]))
-            row, column = place.row[own], place.column[own]
-            first = max(int(row.min()) - self.half, 0)
-            last = max(min(int(row.max()) + samples + self.half, self._rows), first)
-            left, right = int(column.min()), int(column.max()) + SLIT_PIXELS
-            lit = np.arange(first, last)
-        light = np.zeros((last - first + 2 * margin, right - left), np.float32)
+        starts, shares = self.places.starts[begin : end + 1], self._shares[view, part]
         spread = place.row, place.row_shares, place.column, place.slit_shares
-        shared = amplitude * self.places.share[part]
-        add_light(shared, starts, *spread, first - margin, left, light)
-        image = np.zeros((last - first, light.shape[1]), np.float32)
-        smooth_rows(light, kernel, np.arange(-self.half, self.half + 1), lit - first, margin, image)
-        seen, slit = self._cut_to_slit(view, left, right)
-        return first, slit, image[:, seen]
-
-    def _cut_to_slit(self, view: int, left: int, right: int) -> tuple[slice, slice]:
-        """Which of some columns of a view lie on the slit, and where."""
-        first, width = self.footprints[view].first_column + left, self.image.shape[1]
-        start = min(max(first, 0), width)
-        stop = max(start, min(first + right - left, width))
-        return slice(start - first, stop - first), slice(start, stop)
+        add_light(lights, shares, starts, *spread, top, left, light)
+        own = slice(*np.searchsorted(place.lit_rows, (rows.start, rows.stop)))
+        below, aside = corner[0] - place.first_row, corner[1] - place.first_column
+        lit = place.lit_rows[own] - below
+        smooth_rows(light, kernel, self._lags, lit, below - top, aside - left, images)
 
     def _trail(self, light: Image, first: int, rows: int) -> Image:
-        """Some rows of light with its afterglow, from row `first` of `light` on."""
+        """Some rows of light, (n, rows, columns), with its afterglow, from row `first` of it on."""
         from tofclip.recovery.surfaces.kernels import smooth_rows
 
+        rows = max(rows, 0)
         if not self.pulse.reach:
-            return light[first : first + rows]
-        light, image = np.ascontiguousarray(light), np.empty((rows, light.shape[1]), np.float32)
+            return light[:, first : first + rows]
+        images = np.zeros((len(light), rows, light.shape[2]), np.float32)
         shares = self.pulse.shares.astype(np.float32)
-        smooth_rows(light, shares, self.pulse.lags, np.arange(rows), first, image)
-        return image
+        smooth_rows(light, shares, self.pulse.lags, np.arange(rows), first, 0, images)
+        return images
 
     def render(self, amplitude: Image) -> Image:
         """Return A a, (rows, columns)."""
@@ -570,20 +592,20 @@ class SurfaceModel:
 
     def _render_lit(self, amplitude: Image) -> Image:
         """The rows of A a that light reaches."""
-        above = self._lit_before.start
-        total = np.zeros((self._lit_before.stop - above, self.image.shape[1]), np.float32)
-        kernels = [
-            kernel * np.float32(gain)
-            for kernel, gain in zip(self.kernels, self.state.gains, strict=True)
-        ]
-        everywhere = slice(None)
-        seen = self.map_parallel(
-            lambda view: self._project(view, amplitude, kernels[view], everywhere), len(kernels)
-        )
-        for top, slit, light in seen:
-            total[top - above : top - above + len(light), slit] += light
-        rows = self._lit.stop - self._lit.start
-        return self._trail(total, self._lit.start + self.before - above, rows)
+        rows = self._lit_before
+
+        def work(views: range) -> Image:
+            seen = np.zeros((1, rows.stop - rows.start, self.image.shape[1]), np.float32)
+            for view in views:
+                (high, wide), kernel = self.footprints[view].shape, self.kernels[view]
+                box = slice(self._margin, high - self._margin), slice(0, wide)
+                lights, corner = amplitude[np.newaxis], (rows.start, 0)
+                self._project(view, lights, kernel, slice(None), box, corner, seen)
+            return seen
+
+        light = reduce(np.add, self.share_out(work, self.camera.views))
+        first = self._lit.start + self.before - rows.start
+        return self._trail(light, first, self._lit.stop - self._lit.start)[0]
 
     def pull(self, amplitude: Image, image: Image | None = None) -> Image:
         """Return A'W(A a - image), (points,), how the misfit changes with amplitudes; without an image
@@ -601,63 +623,66 @@ class SurfaceModel:
 
     def gather_views(self, image: Image) -> list[Image]:
         """Return what each view adds to A' of an image, (points,) each."""
-        return self._gather_each(image[self._lit], False)
+        lit = self._spread_back(image[self._lit])
+        return [self._gather(lit, (view,)) for view in range(self.camera.views)]
 
     def _gather_lit(self, image: Image, squared: bool = False) -> Image:
         """A' of the rows of an image that light reaches."""
-        total = np.zeros(self.surface.size, np.float32)
-        for found in self._gather_each(image, squared):
-            total += found
-        return total
+        seen = image if squared else self._spread_back(image)
+        shares = self.share_out(partial(self._gather, seen, squared=squared), self.camera.views)
+        return reduce(np.add, shares)
 
-    def _gather_each(self, image: Image, squared: bool) -> list[Image]:
+    def _spread_back(self, image: Image) -> Image:
+        """The adjoint of `_trail`, from the rows of an image that light reaches."""
+        from tofclip.recovery.surfaces.kernels import smooth_rows
+
+        if not self.pulse.reach:
+            return image
+        rows = self._lit_before
+        seen = np.zeros((1, rows.stop - rows.start, image.shape[1]), np.float32)
+        lines = np.arange(seen.shape[1]), rows.start - self._lit.start - self.before
+        shares = self.pulse.shares.astype(np.float32)
+        smooth_rows(image[np.newaxis], shares, -self.pulse.lags, *lines, 0, seen)
+        return seen[0]
+
+    def _gather(self, seen: Image, views: Sequence[int], squared: bool = False) -> Image:
+        """What some views find for points in light before its afterglow, (points,); squared: with the
+        squares of all entries, of which the afterglow is a part.
+        """
         from tofclip.recovery.surfaces.kernels import gather_light, smooth_rows
 
-        lags = np.arange(-self.half, self.half + 1)
-        seen, above = image, self._lit.start + self.before
-        if squared:
-            reach = self.half + self.pulse.reach
-            lags = np.arange(-reach, reach + 1)
-        elif self.pulse.reach:
-            shares, rows = self.pulse.shares.astype(np.float32), self._lit_before
-            seen = np.empty((rows.stop - rows.start, image.shape[1]), np.float32)
-            margin, above = rows.start - above, rows.start
-            smooth_rows(image, shares, -self.pulse.lags, np.arange(len(seen)), margin, seen)
-
-        def work(view: int) -> Image:
-            place, kernel = self.footprints[view], self.kernels[view]
-            gain, slit_shares = self.state.gains[view], place.slit_shares
+        found = np.zeros((1, self.surface.size), np.float32)
+        above, lags = self._lit_before.start, self._lags
+        if squared or not self.pulse.reach:
+            above = self._lit.start + self.before
+        for view in views:
+            place, kernel, shares = self.footprints[view], self.kernels[view], self._shares[view]
+            if not place.lit_rows.size:
+                continue
+            slit_shares = place.slit_shares
             if squared:  # a pulse is smooth: the square of its samples between rows is theirs
-                whole = self.pulse.extend(self.make_kernel(view, variance=0.0))
-                kernel, gain, slit_shares = whole**2, gain**2, slit_shares**2
-            own, slit = self._cut_to_slit(view, 0, place.columns)
-            first = max(int(place.lit_rows.min(initial=0) + self.pulse.lags.min()) - above, 0)
-            last = max(
-                int(place.lit_rows.max(initial=0) + self.pulse.lags.max()) + 1 - above, first
-            )
-            lit = seen[first:last, slit]
-            part = np.zeros((len(lit), place.columns), np.float32)
-            part[:, own] = lit
-            smooth = np.empty((self._rows + 2 * self._margin, place.columns), np.float32)
-            begin = -self._margin - above - first
-            smooth_rows(part, kernel, -lags, place.reached_rows, begin, smooth)
-            found = np.zeros(self.surface.size, np.float32)
-            light = place.row, place.row_shares, place.column, slit_shares
-            gather_light(smooth, gain, self.places.point, *light, -self._margin, found)
-            found *= self.places.share
-            if squared:
-                found *= self.places.overlap
-            found = self.shade(view, found)
-            return self.shade(view, found) if squared else found
+                kernel = self.pulse.extend(self.make_kernel(view, variance=0.0)) ** 2
+                slit_shares = slit_shares**2
+                lags = np.arange(kernel.size) - kernel.size // 2
+                shares = shares**2 * self.places.overlap / self.places.share
+            light = np.zeros((1, *place.shape), np.float32)
+            below = place.first_row - above
+            lines = -lags, place.reached_rows, below, place.first_column
+            smooth_rows(seen[np.newaxis], kernel, *lines, light)
+            spread = place.row, place.row_shares, place.column, slit_shares
+            gather_light(light, shares, self.places.point, *spread, found)
+        return found[0]
 
-        return self.map_parallel(work, self.camera.views)
-
-    def shade(self, view: int, amplitude: Image, part: slice = slice(None)) -> Image:
-        """Return amplitudes, of the points in `part`, as a view sees them."""
-        return np.asarray(amplitude * self._shades[view, part], np.float32)
+    def shade(self, view: int, amplitude: Image) -> Image:
+        """Return amplitudes, (points,), as a view sees them."""
+        return np.asarray(amplitude * self._shades[view], np.float32)
 
     def _find_shades(self) -> None:
-        """How bright each view sees each point, (views, points), beside its amplitude."""
+        """How bright each view sees each point, (views, points), beside its amplitude; and how much light
+        it has of each of the point's places.
+        """
         shading = np.exp(np.where(self.behind, self.state.shading.T[:, self.surface], 0))
         shading[:, self.outer] *= np.maximum(1 + self.state.borders * self.excess, 0)
         self._shades = shading.astype(np.float32)
+        shading *= self.state.gains[:, np.newaxis]
+        self._shares = (shading * self.places.share).astype(np.float32)

@@ -99,23 +99,23 @@ def iterate_derivatives(model: SurfaceModel, amplitude: Image) -> Iterator[Deriv
 
 
 def _join_windows(
-    model: SurfaceModel, names: list[Unknown], windows: Sequence[Sequence[Window]]
+    model: SurfaceModel, names: list[Unknown], windows: Sequence[Window]
 ) -> Iterator[Derivatives]:
-    """Yield derivatives by some unknowns as windows show them, (places, unknowns), those of one place
-    of one size: on whole clusters, and windows that share one as one part.
+    """Yield derivatives by some unknowns as windows show them, an image for each: on whole clusters, and
+    windows that share one as one part.
     """
     rows, columns = model.image.shape
-    boxes: list[tuple[int, int, int, int, list[Sequence[Window]]]] = []
-    for place in windows:
-        if not place[0].image.size:
+    boxes: list[tuple[int, int, int, int, list[Window]]] = []
+    for window in windows:
+        if not window.images.size:
             continue
         (top, bottom), (left, right) = (
             (area.start // side * side, min(-(-area.stop // side) * side, size))
             for area, side, size in zip(
-                place[0].area, (CLUSTER_ROWS, CLUSTER_COLUMNS), (rows, columns), strict=True
+                window.area, (CLUSTER_ROWS, CLUSTER_COLUMNS), (rows, columns), strict=True
             )
         )
-        held, apart = [place], []
+        held, apart = [window], []
         # a box that grows may meet others that were apart
         while True:
             for box in boxes:
@@ -133,26 +133,25 @@ def _join_windows(
         yield Derivatives(names, 0, 0, np.zeros((len(names), 0, 0), np.float32))
     for top, bottom, left, right, held in boxes:
         images = np.zeros((len(names), bottom - top, right - left), np.float32)
-        for place in held:
-            for image, window in zip(images, place, strict=True):
-                height, width = window.image.shape
-                row, column = window.row - top, window.column - left
-                image[row : row + height, column : column + width] += window.image
+        for window in held:
+            _, height, width = window.images.shape
+            row, column = window.row - top, window.column - left
+            images[:, row : row + height, column : column + width] += window.images
         yield Derivatives(names, top, left, images)
 
 
 def _differentiate_view(model: SurfaceModel, amplitude: Image, view: int) -> list[Derivatives]:
-    kernel, gain = model.kernels[view], np.float32(model.state.gains[view])
+    kernel = model.kernels[view]
     wider = (model.make_kernel(view, 1 + WIDTH_STEP) - kernel) / np.float32(WIDTH_STEP)
-    windows = [model.receive(view, amplitude, gain * one) for one in (kernel, wider)]
-    beside = np.gradient(windows[0].image, axis=1) if windows[0].image.size else windows[0].image
-    windows.append(windows[0]._replace(image=-beside.astype(np.float32)))
+    seen, widened = (model.receive(view, amplitude, one) for one in (kernel, wider))
+    beside = -np.gradient(seen.images, axis=2) if seen.images.size else seen.images
+    images = np.concatenate([seen.images, widened.images, beside])
     names: list[Unknown] = [(name, 0, view) for name in ("gains", "widths", "centres")]
-    found = [*_join_windows(model, names, [windows])]
+    found = [*_join_windows(model, names, [seen._replace(images=images)])]
     for surface in np.unique(model.surface[model.behind]):
         part = model.parts[surface]
-        hidden = model.receive(view, amplitude[part] * model.behind[part], gain * kernel, part)
-        found += _join_windows(model, [("shading", int(surface), view)], [[hidden]])
+        hidden = model.receive(view, amplitude[part] * model.behind[part], kernel, part)
+        found += _join_windows(model, [("shading", int(surface), view)], [hidden])
     return found
 
 
@@ -163,19 +162,18 @@ def _differentiate_sweep(model: SurfaceModel, amplitude: Image, view: int) -> li
         weight = place.between.weigh_centre(view)
         if not weight.any():
             continue
-        slope = differentiate_pulse(model.kernels[other]) * np.float32(model.state.gains[other])
         light = amplitude * weight
-        lights = light, light * place.height
-        windows.append([model.receive(other, one.astype(np.float32), slope) for one in lights])
+        lights = np.array([light, light * place.height], np.float32)
+        windows.append(model.receive(other, lights, differentiate_pulse(model.kernels[other])))
     return [*_join_windows(model, [("delays", 0, view), ("stretches", 0, view)], windows)]
 
 
 def _differentiate_borders(model: SurfaceModel, amplitude: Image, _: int) -> list[Derivatives]:
     windows = []
-    for view, (kernel, gain) in enumerate(zip(model.kernels, model.state.gains, strict=True)):
+    for view, kernel in enumerate(model.kernels):
         light = np.zeros_like(amplitude)
         light[model.outer] = amplitude[model.outer] * model.excess[view]
-        windows.append([model.receive(view, light, np.float32(gain) * kernel)])
+        windows.append(model.receive(view, light, kernel))
     return [*_join_windows(model, [("borders", 0, 0)], windows)]
 
 
@@ -191,9 +189,8 @@ def _differentiate_surface(
     lights = np.ascontiguousarray(in_range.T, np.float32)
     windows = []
     for view, place in enumerate(model.footprints):
-        slope = differentiate_pulse(model.kernels[view])
-        slope *= np.float32(model.state.gains[view] * place.rows_per_instant)
-        windows.append([model.receive(view, light, slope, part) for light in lights])
+        slope = differentiate_pulse(model.kernels[view]) * np.float32(place.rows_per_instant)
+        windows.append(model.receive(view, lights, slope, part))
     names = [("coefficients", surface, number) for number in range(len(lights))]
     return [*_join_windows(model, names, windows)]
 
@@ -532,7 +529,7 @@ def _eliminate_amplitude(
     than they are.
     """
     own = [group for group in groups if group.names[0][0] == "coefficients"]
-    shares = [basis.split_quadratic() for basis in model.bases]
+    shares = [basis.quadratic_parts for basis in model.bases]
     changes = np.zeros((ROUND_COEFFICIENTS, model.surface.size), np.float32)
     iterations = ELIMINATION_ITERATIONS
     if start is not None:
@@ -560,10 +557,7 @@ def _eliminate_amplitude(
         part = model.parts[surface]
         own = changes[: len(shares[surface][1]), part]
         windows = [
-            [model.receive(view, change, gain * kernel, part) for change in own]
-            for view, (kernel, gain) in enumerate(
-                zip(model.kernels, model.state.gains.astype(np.float32), strict=True)
-            )
+            model.receive(view, own, kernel, part) for view, kernel in enumerate(model.kernels)
         ]
         names = [("explained", surface, number) for number in range(len(own))]
         return [*_join_windows(model, names, windows)]
@@ -643,7 +637,7 @@ def _move(
             values[number] += value * (values[number] if name in ("gains", "widths") else 1.0)
     for surface, part in enumerate(model.parts):
         own = [i for i, name in enumerate(names) if name[:2] == ("coefficients", surface)]
-        _, quadratic = model.bases[surface].split_quadratic()
+        _, quadratic = model.bases[surface].quadratic_parts
         along = -quadratic @ change[own]
         along[0] += change[names.index(("patterns", surface, 0))]
         ahead[part] += along.astype(np.float32) @ changes[: along.size, part]

@@ -12,6 +12,7 @@ range is steeper there than any polynomial or spline.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -78,9 +79,10 @@ class SmoothBasis:
         """Return the derivatives of inverse depths by the coefficients, (pixels, n)."""
         return functions
 
-    def split_quadratic(self) -> tuple[FloatArray, FloatArray]:
-        """Return the coefficients of the six monomials over this basis, (n, 6), and what of each
-        function is such a quadratic, (6, n), both as least squares over the splines' box.
+    @cached_property
+    def quadratic_parts(self) -> tuple[FloatArray, FloatArray]:
+        """Coefficients of the six monomials over this basis, (n, 6), and what of each function is such a
+        quadratic, (6, n), both as least squares over the splines' box.
         """
         if self.is_quadratic:
             return np.eye(COEFFICIENTS), np.eye(COEFFICIENTS)
@@ -126,7 +128,8 @@ class QuadricBasis(SmoothBasis):
         x, y = 2 * (column - left + 0.5) / wide - 1, 2 * (row - top + 0.5) / high - 1
         return _stack_monomials(x, y)
 
-    def split_quadratic(self) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def quadratic_parts(self) -> tuple[FloatArray, FloatArray]:
         """No quadratic follows a limb: all functions count on their own, (9, 9)."""
         return np.eye(ROUND_COEFFICIENTS), np.eye(ROUND_COEFFICIENTS)
 
