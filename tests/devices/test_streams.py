@@ -4,7 +4,6 @@ instrument's clock estimated from messages that are delayed, and a connection th
 
 import dataclasses
 import resource
-import socket
 import threading
 import time
 from pathlib import Path
@@ -25,18 +24,13 @@ from devices.source import (
     Ledger,
     Piece,
     RingBuffer,
-    Stats,
     as_bytes,
 )
 from devices.stream import WINDOW_S, InstrumentClock, StreamOptions, StreamSource
-from devices.tcp import TcpLink
 from devices.timetag_codec import RECORD_BYTES
 from tofclip.errors import (
     BufferOverflowError,
-    DeviceDisconnectedError,
-    DeviceNotFoundError,
     DeviceTimeoutError,
-    ProtocolError,
 )
 
 SOON, LONG = 0.02, 5.0
@@ -130,27 +124,6 @@ def test_a_writer_waits_for_room_or_the_end():
     assert [ring.get(SOON) is not None for _ in range(3)] == [True, True, False]
 
 
-def test_the_first_fault_counts():
-    ring = RingBuffer(10, "block", Ledger())
-    for said in ("first", "second"):
-        ring.fail(DeviceDisconnectedError(said))
-    with pytest.raises(DeviceDisconnectedError, match="first"):
-        ring.get(SOON)
-
-
-def test_every_change_moves_records_between_accounts():
-    ledger = Ledger()
-    ledger.receive(10)
-    ledger.deliver(4, 1)
-    ledger.drop(2)
-    ledger.truncate()
-    ledger.lose(5)
-    ledger.time_out()
-    ledger.reconnect()
-    assert ledger.stats == Stats(16, 4, 3, 2, 5, 2, timeouts=1, reconnects=1)
-    assert ledger.stats.is_balanced
-
-
 def test_changes_at_the_same_time_all_count(monkeypatch):
     """Another thread gets its turn between reading the accounts and writing them."""
 
@@ -223,68 +196,6 @@ def test_what_a_clock_forgets(messages, asked):
     for stamp, arrived_at in messages:
         clock.observe(stamp, arrived_at)
     assert clock.to_host(asked[0]) == pytest.approx(asked[1])
-
-
-Ends = tuple[TcpLink, socket.socket]
-
-
-@pytest.fixture
-def ends():
-    with (
-        socket.create_server(("127.0.0.1", 0)) as server,
-        TcpLink("127.0.0.1", server.getsockname()[1], LONG) as link,
-        server.accept()[0] as other,
-    ):
-        yield link, other
-
-
-def test_messages_are_cut_where_they_end(ends):
-    link, other = ends
-    other.sendall(b"RemoteEx Ready\r0,App")
-    assert link.read_until(b"\r", 100, LONG) == b"RemoteEx Ready"
-    assert link.read_exactly(2, 10, LONG) == b"0,"
-    assert link.read_available(2, LONG) == b"Ap"
-    assert link.read_available(100, LONG) == b"p"
-    link.send(b"x", LONG)
-    assert other.recv(10) == b"x"
-
-
-def test_what_came_before_a_timeout_is_kept(ends):
-    link, other = ends
-    other.sendall(b"half")
-    with pytest.raises(DeviceTimeoutError):
-        link.read_exactly(8, 8, SOON)
-    with pytest.raises(DeviceTimeoutError):
-        link.read_until(b"!", 100, SOON)
-    other.sendall(b"done!")
-    assert link.read_until(b"!", 100, LONG) == b"halfdone"
-    with pytest.raises(DeviceTimeoutError):
-        link.read_available(1, SOON)
-
-
-def test_lengths_from_the_wire_are_bounded(ends):
-    link, other = ends
-    for length in (-1, 11, 1 << 60):
-        with pytest.raises(ProtocolError, match="at most 10"):
-            link.read_exactly(length, 10, LONG)
-    other.sendall(b"x" * 500)
-    with pytest.raises(ProtocolError, match="without the end"):
-        link.read_until(b"\r", 100, LONG)
-
-
-def test_a_server_that_leaves_or_is_not_there(ends):
-    link, other = ends
-    other.close()
-    with pytest.raises(DeviceDisconnectedError, match="closed"):
-        link.read_available(1, LONG)
-    link.close()
-    with pytest.raises(DeviceDisconnectedError):
-        link.send(b"x", LONG)
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    for host in ("127.0.0.1", "no.such.host.invalid"):
-        with pytest.raises(DeviceNotFoundError, match=f"{host}:{port}"):
-            TcpLink(host, port, LONG)
 
 
 MINUTE_S = 60.0

@@ -3,6 +3,7 @@ and scripted servers that can fail.
 """
 
 import socket
+import string
 import threading
 import time
 from collections.abc import Callable
@@ -193,8 +194,10 @@ def test_servers_are_for_this_computer_only():
 
 # RemoteEx's messages
 
-names = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,20}", fullmatch=True)
-letters = st.characters(codec="latin-1", exclude_characters=",()", exclude_categories=["Cc"])
+names = st.text(string.ascii_letters, min_size=1, max_size=20)
+letters = st.sampled_from(
+    [chr(n) for n in (*range(32, 127), *range(160, 256)) if chr(n) not in ",()"]
+)
 arguments = st.lists(st.text(letters, max_size=9), max_size=5).filter(lambda words: words != [""])
 
 

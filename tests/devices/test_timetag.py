@@ -2,7 +2,6 @@
 time, what the real one does and a first driver did not expect; and the light that falls on it.
 """
 
-import array
 import contextlib
 import errno
 import time
@@ -17,15 +16,11 @@ import devices
 from devices.emulation.harness import Fault
 from devices.emulation.scenes import simulate_line_light
 from devices.emulation.timetag import (
-    BLOCK_TICKS,
     BOARD_MEMORY_BYTES,
     CLOCK_HZ,
-    COMMAND,
-    MAGIC,
     MAX_TICK,
     PERIOD_TICKS,
     SCENE_SCALE,
-    SYNC_MASK,
     EmulatedTimeTagger,
     PoissonStream,
     PulsedSceneStream,
@@ -33,9 +28,7 @@ from devices.emulation.timetag import (
 from devices.emulation.usb import VirtualUsb, make_usb_error
 from devices.source import as_bytes
 from devices.timetag import (
-    COMMAND_ENDPOINT,
     DATA_ENDPOINT,
-    REPLY_ENDPOINT,
     USB_IDENTITY,
     Capture,
     Register,
@@ -43,7 +36,6 @@ from devices.timetag import (
     TimeTaggerFeed,
     TimeTagOptions,
 )
-from devices.timetag_codec import COUNTER_RANGE, WRAP
 from devices.transients import read_transient
 from devices.usb import UsbLink
 from tofclip.errors import (
@@ -75,19 +67,6 @@ def compiled():
     assert len(true_records(1, 10)) == 10
 
 
-def test_what_it_says_of_itself():
-    with devices.open(SMALL) as source:
-        assert source.info.as_dict() == {
-            "instrument": "FX2 time tagger",
-            "serial": "",  # as of the real ones
-            "version": 6,
-            "clock_hz": CLOCK_HZ,
-            "usb": "04b4:1004",
-        }
-        assert source.calibration is not None
-        assert source.calibration.attribute("tick_s") == 1 / CLOCK_HZ
-
-
 def test_photons_are_poisson():
     words = PoissonStream(RATE, CLOCK_HZ, 8).next_words(200_000, MAX_TICK)
     records = TAGS.decode(as_bytes(words), TAGS.start).records
@@ -97,23 +76,6 @@ def test_photons_are_poisson():
     assert abs(gaps.std() - np.sqrt(90)) < 0.2
     shares = np.bincount(records["channels"], minlength=9)[[1, 2, 4, 8]] / len(records)
     assert_allclose(shares, 0.25, atol=0.005)  # four standard deviations
-
-
-def test_wraps_are_in_the_stream_and_cuts_are_not():
-    rare = 5.0  # photons per second: the counter wraps every 537 s
-    whole = PoissonStream(rare, CLOCK_HZ, 2).next_words(20_000, MAX_TICK)
-    light = PoissonStream(rare, CLOCK_HZ, 2)
-    pieces = [
-        light.next_words(1, MAX_TICK) if number % 3 else light.next_words(7, COUNTER_RANGE)
-        for number in range(500)
-    ]
-    cut = np.concatenate(pieces)
-    assert_array_equal(cut, whole[: len(cut)])
-    found = TAGS.decode(as_bytes(whole), TAGS.start)
-    assert found.malformed == 0
-    marks = found.records[found.records["flags"] == WRAP]["time_ticks"]
-    assert_array_equal(marks, COUNTER_RANGE * np.arange(1, len(marks) + 1))
-    assert len(marks) == found.records["time_ticks"][-1] // COUNTER_RANGE > 5
 
 
 def test_photons_come_when_they_are_due():
@@ -140,14 +102,6 @@ def test_a_full_memory_loses_photons_and_says_so():
         finish(source)
     assert source.stats.lost_device == instrument.truth.lost_memory_full > 0
     assert source.stats.acquired == instrument.truth.registered
-
-
-@pytest.mark.parametrize("command", ["", "aa0002", "ab00020000000000"])
-def test_a_wrong_command_is_not_answered(command):
-    link = link_to(make_tagger(stale_replies=0, jammed_bytes=0))
-    link.write(COMMAND_ENDPOINT, bytes.fromhex(command), 0.1)
-    with pytest.raises(DeviceTimeoutError):
-        link.read(REPLY_ENDPOINT, array.array("B", bytes(8)), 0.1)
 
 
 @pytest.mark.parametrize(("length", "said"), [(3, "answered 3 bytes"), (4, "0 Hz")])
@@ -255,33 +209,6 @@ def test_a_full_stream_takes_few_transfers():
     assert source.stats.delivered / instrument._transfers > 2000
 
 
-def test_registration_that_begins_with_the_counter_sees_a_wrap():
-    """Which is why the driver starts the counter first."""
-    instrument = make_tagger(old_records=0)
-    instrument._write_register(Register.CAPTURE, Capture.COUNT | Capture.REGISTER)
-    assert instrument.truth.registered == 1
-    assert bytes(instrument._stream) == bytes([0x40, 0, 0, 0, 0, 0])
-
-
-@pytest.mark.parametrize("stale", [1, 2])
-def test_a_late_reply_does_not_answer_the_next_request(stale):
-    """What another program asked, and never fetched, comes while this one works."""
-    instrument = make_tagger()
-    tagger = TimeTagger(link_to(instrument))
-
-    def reply_late():
-        for _ in range(stale):
-            instrument.receive(COMMAND_ENDPOINT, COMMAND.pack(MAGIC, 0, Register.CLOCK, 0))
-
-    tagger.write(Register.STROBE, 5)
-    reply_late()
-    assert tagger.read(Register.STROBE) == 5
-    reply_late()
-    tagger.write(Register.STROBE, 9)
-    assert tagger.read(Register.STROBE) == 9
-    assert tagger.version == 6
-
-
 @pytest.mark.parametrize("silent", [0, 1, 2])
 def test_records_of_the_last_session_are_thrown_away_though_they_come_slowly(silent):
     """One request for them is not answered in time."""
@@ -312,61 +239,11 @@ def test_no_reply_is_taken_for_another(kind, number):
 # A simulated scene before the emulated time tagger: the photons' delays are the scene's.
 
 SCENE_RATE = 2e6
-STEPS = 50
-"""Instants by which the duration of a row is stood for."""
 
 
 @pytest.fixture(scope="module")
 def light():
     return simulate_line_light()
-
-
-def seen(scene, limit, last=MAX_TICK):
-    found = TAGS.decode(as_bytes(scene.next_words(limit, last)), TAGS.start)
-    assert found.malformed == 0
-    return found.records
-
-
-def test_delays_are_those_of_the_scene(light):
-    records = seen(PulsedSceneStream(light, SCENE_RATE, CLOCK_HZ, 4), 400_000)
-    is_pulse = records["channels"] & SYNC_MASK != 0
-    assert np.all(records["time_ticks"][is_pulse] % PERIOD_TICKS == 0)
-    assert np.all(np.diff(records["time_ticks"][is_pulse]) == PERIOD_TICKS)
-    pulses = np.count_nonzero(is_pulse)
-    expected = light.photons[:, 256 * np.array([1, 3, 5]) // 6]
-    expected = expected * (SCENE_RATE * PERIOD_TICKS / CLOCK_HZ * pulses / expected.sum())
-    width = light.row_times[1] - light.row_times[0]
-    instants = light.row_times[:, np.newaxis] + width * (np.arange(0.5, STEPS) / STEPS - 0.5)
-    ticks = np.floor(instants * SCENE_SCALE * CLOCK_HZ).astype(int).ravel() % PERIOD_TICKS
-    for pixel, channel in enumerate((2, 4, 8)):
-        delays = records["time_ticks"][records["channels"] & channel != 0] % PERIOD_TICKS
-        counts = np.bincount(delays, minlength=PERIOD_TICKS)
-        known = np.bincount(ticks, np.repeat(expected[:, pixel] / STEPS, STEPS), PERIOD_TICKS)
-        # Five standard deviations; two photons within a tick that count as one.
-        tolerance = 5 * np.sqrt(known + 1) + known**2 / pulses
-        assert np.all(np.abs(counts - known) < tolerance)
-        assert counts.sum() > 50_000
-
-
-def test_cuts_do_not_change_the_stream(light):
-    whole = seen(PulsedSceneStream(light, SCENE_RATE, CLOCK_HZ, 5), 40_000)
-    scene = PulsedSceneStream(light, SCENE_RATE, CLOCK_HZ, 5)
-    limits = ((10_000, MAX_TICK), (40_000, BLOCK_TICKS), (5, BLOCK_TICKS))
-    pieces = [scene.next_words(*limit) for limit in limits]
-    assert len(pieces[2]) == 0
-    pieces.append(scene.next_words(40_000 - sum(map(len, pieces)) // 6, MAX_TICK))
-    assert_array_equal(TAGS.decode(np.concatenate(pieces), TAGS.start).records, whole)
-    assert len(scene.next_words(0, MAX_TICK)) == 0
-
-
-def test_the_counter_wraps_where_a_block_begins(light):
-    scene = PulsedSceneStream(light, SCENE_RATE, CLOCK_HZ, 6)
-    scene._block = COUNTER_RANGE // BLOCK_TICKS - 1
-    before = COUNTER_RANGE - BLOCK_TICKS
-    records = seen(scene, 40_000)
-    assert records["time_ticks"][0] == before
-    marks = records[records["flags"] == WRAP]
-    assert marks["time_ticks"].tolist() == [COUNTER_RANGE]
 
 
 def test_light_that_does_not_fit_is_refused(light):

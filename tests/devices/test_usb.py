@@ -62,13 +62,6 @@ def received(link):
     return buffer[: link.read(IN, buffer, 0.1)].tobytes()
 
 
-def test_bytes_go_out_and_come_in():
-    link = linked(Echo())
-    link.write(OUT, b"hello", 0.1)
-    assert (link.serial, received(link)) == ("A1", b"hello")
-    link.close()
-
-
 def test_the_serial_number_chooses():
     first, second = Echo("A1"), Echo("B2")
     assert linked(first, second, serial="B2").serial == "B2"
