@@ -24,7 +24,6 @@ from tofclip.vectors import (
     copy_transposed,
     count_set_lanes,
     fill_vector,
-    find_first_bit,
     find_highest_lane,
     list_set_lanes,
     load_vector,
@@ -164,38 +163,6 @@ def test_arithmetic_and_choice(one, other):
     np.testing.assert_array_equal(results, expected)
     assert (total, highest, number) == (one.sum(), other.max(), (one >= other).sum())
     assert int(bits) == sum(1 << k for k in np.flatnonzero(one >= other).tolist())
-
-
-@njit
-def _find_bit(word):
-    return find_first_bit(word)
-
-
-@given(st.integers(1, 2**64 - 1))
-def test_bits(word):
-    first = _find_bit(np.uint64(word))
-    assert word % (2 << int(first)) == 1 << int(first)
-
-
-@njit
-def _find_highest_number(numbers):
-    return find_highest_lane(load_vector(numbers, np.uintp(0)))
-
-
-@given(arrays(np.int32, vectors.LENGTH))
-def test_the_highest_whole_number(numbers):
-    assert _find_highest_number(numbers) == numbers.max()
-
-
-@njit
-def _copy_shifted(values, start):
-    store_vector(values, np.uintp(0), load_vector(values, np.uintp(start)))
-
-
-def test_vectors_begin_anywhere():
-    values = np.arange(40, dtype=np.float32)
-    _copy_shifted(values, 21)
-    np.testing.assert_array_equal(values, [*range(21, 37), *range(16, 40)])
 
 
 @njit

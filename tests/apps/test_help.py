@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from verb_pages import collect_verbs, render_page, write_pages
+from verb_pages import collect_verbs, write_pages
 
 import tofclip
 from apps.cli import COMPLETION_VARIABLE, VERB_OVERVIEW, app, split_docstring, wrap_command
@@ -32,12 +32,6 @@ def test_help_of_a_verb(shell, monkeypatch, name):
     for example in split_docstring(VERBS[name].callback.__doc__)[1]:
         assert f"Example:\n      {wrap_command(example).splitlines()[0]}\n" in outcome.out
         assert all(line.strip() in outcome.out for line in wrap_command(example).splitlines())
-
-
-@pytest.mark.parametrize("group", ["", "lidar"])
-def test_the_list_of_commands_is_shown_whole(shell, group):
-    shown = " ".join(shell(f"{group} --help").out.split())
-    assert "..." not in shown.partition("Commands:")[2]
 
 
 def test_the_list_of_commands_says_what_the_verbs_say():
@@ -166,15 +160,6 @@ def test_a_page_for_each_verb(tmp_path):
     assert "tofclip --install-completion" in listed
 
 
-def test_what_a_page_says():
-    text = render_page("lidar scene", VERBS["lidar scene"])
-    assert text.startswith("# tofclip lidar scene\n\nList a scene's objects")
-    assert "```sh\ntofclip lidar scene frames.h5 --out scene.png\n```" in text
-    assert "`--reach-mm MM`\n: Points this close belong together. \\[default: 40.0\\]" in text
-    assert "## Arguments\n\n`FRAMES" in text
-    assert "## Arguments" not in render_page("devices list", VERBS["devices list"])
-
-
 def test_the_help_has_the_headings_of_the_page(shell):
     """Settings apart from options, defaults in words without brackets of their own, prose as wide as
     the terminal even where a line begins with an option, and arguments by their names.
@@ -191,10 +176,3 @@ def test_the_help_has_the_headings_of_the_page(shell):
     usage = shell("calibrate range --help").out.splitlines()[0]
     assert "SHOT..." in usage
     assert "{" not in usage
-
-
-def test_a_flag_is_shown_without_a_type(shell):
-    for words in ("", "recover", "lidar", "lidar sequence"):
-        shown = shell(f"{words} --help").out
-        assert "--help" in shown
-        assert "<bool>" not in shown

@@ -10,7 +10,6 @@ from PIL import Image
 from small_instrument import HIDDEN_POINT
 
 from apps.figures.style import open_film
-from apps.verbs.nlos_imaging import _reset_peak_memory, measure_imaging
 from nlos import Capture, Grid, TransientVideo, Volume
 from nlos.known_scenes import HiddenTruth, compare_with_truth, measure_sharpness
 from tofclip.errors import StorageError
@@ -40,41 +39,6 @@ def test_a_curved_wall(shell):
         assert figures["energy_near_truth"] > 2 * share
         assert figures["contrast_to_truth"] > 2
     assert Path("compare.png").read_bytes().startswith(PNG)
-
-
-def test_its_settings_give_the_same_comparison(shell):
-    one = shell.figures("nlos compare {confocal} --methods fk,rsd --voxel-mm 60 --out one.png")
-    two = shell.figures("nlos compare {confocal} --settings one.toml --out two.png")
-    for figures in (*one["methods"].values(), *two["methods"].values()):
-        del figures["seconds"], figures["peak_mib"]
-    assert one == two
-
-
-def test_memory_is_that_of_the_method():
-    if _reset_peak_memory() is None:
-        pytest.skip("this system does not tell how much memory a program took")
-
-    class Greedy:
-        """Takes 64 MiB for a moment."""
-
-        cost = 1
-
-        def plan(self, _, grid):
-            self.grid = grid
-            return self
-
-        def reconstruct(self, capture, grid):
-            return self.plan(capture, grid).image(capture)
-
-        def image(self, *_):
-            taken = np.ones(64 << 17)
-            return Volume(np.full(self.grid.shape, taken.mean(), np.float32), self.grid)
-
-    capture = Capture(np.zeros((4, 2)), np.array([[0.0, 0, 0], [1, 0, 0]]), np.zeros(3), 1e-11)
-    found = measure_imaging("greedy", Greedy(), capture, Grid([0.0], [0.0], [1.0]))
-    # The allocator may reuse memory that it holds already, and threads may take a little for
-    # themselves.
-    assert 48 << 20 < found.peak_bytes < 96 << 20
 
 
 def test_memory_is_foretold_within_a_factor(shell):

@@ -1,7 +1,6 @@
 """`tofclip nlos`: captures simulated, described, imaged, refined and traced to surfaces."""
 
 import shlex
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -144,15 +143,6 @@ class TestReconstruct:
             assert getattr(one.grid, axis).tobytes() == getattr(two.grid, axis).tobytes()
         assert Path("one.toml").read_text() == Path("two.toml").read_text()
 
-    def test_flags_win(self, shell):
-        mine = "voxel_mm = 50\nmethod = 'backprojection'\nx_m = [-0.2, 0.3]\n"
-        Path("mine.toml").write_text(mine)
-        box = "--voxel-mm 100 --y-m -0.1 0.1 --near-m 0.5 --far-m 0.6 --everywhere"
-        found = shell.figures(f"nlos reconstruct {{curved}} --settings mine.toml {box} --out v.h5")
-        assert (found["voxel_mm"], found["method"]) == (100.0, "backprojection")
-        assert found["voxels"] == [2, 3, 6]
-        assert tomllib.loads(Path("v.toml").read_text())["x_m"] == [-0.2, 0.3]
-
     @pytest.mark.parametrize("method", ["rsd", "lct", "fk"])
     def test_confocal_scans(self, shell, method):
         found = shell.figures(
@@ -216,22 +206,6 @@ class TestRefine:
         assert refined > 0.7 > 0.3 > plain
         reported = Path("two.toml").read_text()
         assert 'refine = "photons"\niterations = 12\nprior_weight = 1.0\n' in reported
-
-    def test_its_settings_give_the_same_volume(self, shell):
-        mine = "refine = 'l1'\niterations = 2\nprior_weight = 0.1\nvoxel_mm = 30\n"
-        Path("mine.toml").write_text(mine)
-        words = f"--wavelength-mm 200 {BOX} --settings mine.toml --out one.h5"
-        shell.figures(f"nlos reconstruct {{curved}} {words}")
-        shell.figures("nlos reconstruct {curved} --settings one.toml --out two.h5")
-        one, two = pair()
-        np.testing.assert_array_equal(one.values, two.values)
-
-    def test_it_stays_with_the_compiled_loops(self, shell):
-        pytest.importorskip("torch")
-        words = f"{BOX} --voxel-mm 50 --wavelength-mm 300 --refine l1 --iterations 1 --out v.h5"
-        line = f"nlos reconstruct {{curved}} {words} --device"
-        shell.refuses(f"{line} torch:cpu", "iterative refinement works on NumPy arrays only")
-        assert shell.figures(f"{line} auto")["device"] == "cpu"
 
     def test_voxels_that_the_wavelength_does_not_resolve(self, shell):
         words = f"{BOX} --refine l1 --wavelength-mm 100 --voxel-mm 50 --out volume.h5"

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apps.figures.shot import MAX_MOMENTS, choose_moments, make_preview_figure
+from apps.figures.shot import choose_moments, make_preview_figure
 from apps.figures.style import make_figure
 from apps.options import load_settings, save_settings, setting, settings_to_dict
 from apps.progress import show_activity, show_progress
@@ -25,7 +25,6 @@ from nlos.known_scenes import WALLS, SceneSettings
 from tofclip import Frames, Streak
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.notebook import save_figure
-from tofclip.storage import Record
 
 
 class TestReport:
@@ -95,12 +94,6 @@ class TestReport:
         report(figures, as_json=False, written=[Path("out.h5")])
         assert capsys.readouterr().out.splitlines() == [*lines, "wrote out.h5"]
 
-    def test_many_things_stand_below_each_other(self, capsys):
-        found = {f"object_{number}": {"range_m": 1.5, "points": 7} for number in range(12)}
-        report(found, as_json=False)
-        lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-        assert (lines[0], lines[12]) == (["range", "m", "points"], ["object", "11", "1.5", "7"])
-
 
 class TestProgress:
     def test_after_ctrl_c_every_thread_stops(self):
@@ -166,9 +159,6 @@ def frames_with(camera, energy, attachments=None):
     return Frames(values, times, camera, attachments=attachments or {})
 
 
-WALL = {"relay_wall": Record("relay_wall")}
-
-
 def bumps(places, sigma, size=300):
     return np.exp(-(((np.arange(size)[:, np.newaxis] - places) / sigma) ** 2) / 2)
 
@@ -181,25 +171,6 @@ class TestMoments:
         assert [moment.frame for moment in found] == pytest.approx(rows, abs=1)
         # Half height of a Gaussian of 2.5 bins, smoothed by 1.5, is 3.4 bins away from its peak.
         assert [moment.last - moment.first for moment in found[:4]] == pytest.approx([7] * 4, abs=1)
-
-    def test_light_without_a_pause_is_cut_into_even_shares(self, camera):
-        energy = bumps([150], 40)[:, 0]
-        moments = choose_moments(frames_with(camera, energy, WALL))
-        assert len(moments) == MAX_MOMENTS
-        shares = [energy[moment.first : moment.last + 1].sum() / energy.sum() for moment in moments]
-        # A twelfth each, up to the frame that a cut falls on (at most 1 % of the light).
-        np.testing.assert_allclose(shares, 0.98 / MAX_MOMENTS, atol=0.011)
-
-    def test_brightness_is_compensated_only_where_time_tells_the_range(self, camera):
-        """A far peak is below the limit as measured, and above it once the fall-off with range is
-        undone.
-        """
-        energy = np.zeros(1000)
-        energy[[20, 500, 980]] = [1.0, 0.3, 0.008]
-        energy[[100, 200, 300, 400]] = 0.5
-        for attachments, is_shown in (({}, True), (WALL, False)):
-            found = choose_moments(frames_with(camera, energy, attachments))
-            assert (980 in [moment.frame for moment in found]) == is_shown
 
     @pytest.mark.parametrize("energy", [np.ones(1), np.zeros(5), np.zeros(50)])
     def test_the_picture_can_always_be_drawn(self, camera, tmp_path, energy):

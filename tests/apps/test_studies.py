@@ -16,7 +16,6 @@ from apps.studies.cases import (
     BestFigure,
     Case,
     Library,
-    Row,
     choose_settings,
     list_best_cases,
     measure_case,
@@ -97,11 +96,6 @@ class TestCases:
         )
         # 80 x 40 measurements: the standard deviation of a standard deviation is 1.3 %
         assert np.std(noisy - quiet) / np.std(quiet) == pytest.approx(0.1, rel=0.06)
-
-    def test_the_mean_and_the_spread_are_those_of_a_sample(self):
-        assert Row(("x",), (1.0, 3.0)).mean == 2.0
-        assert Row(("x",), (1.0, 3.0)).spread == pytest.approx(np.sqrt(2))
-        assert Row(("x",), (1.0,)).spread == 0.0
 
     def test_scenes_are_rendered_once_and_variants_differ(self, library):
         scene = library.light_field("blocks")

@@ -132,7 +132,6 @@ POLYNOMIAL = PolynomialSweep(
 PROJECTIVE = ProjectiveSweep(np.array([[1.0, 0.5, 3.0], [0.0, 2.0, -1.0], [0.001, 0.0, 1.0]]))
 LEANING = ProjectiveSweep(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.01, 1.0]]))
 FOUR = SkewSweep(np.array([0.0, 10, 20, 40]), np.array([0.0, 5, -3, 1]), np.zeros(4))
-every_sweep = pytest.mark.parametrize("sweep", [SKEW, POLYNOMIAL, PROJECTIVE])
 
 
 @pytest.mark.parametrize(
@@ -160,16 +159,6 @@ every_sweep = pytest.mark.parametrize("sweep", [SKEW, POLYNOMIAL, PROJECTIVE])
 def test_sweeps_by_hand(sweep, rectified, raw):
     found = sweep.raw_position(*np.array(rectified, float))
     assert tuple(map(float, found)) == pytest.approx(raw, abs=1e-12)
-
-
-@every_sweep
-def test_rows_and_columns_of_a_sweep_broadcast(sweep):
-    rows, columns = np.arange(5.0), np.linspace(0, 400, 7)
-    grid = sweep.raw_position(rows[:, np.newaxis], columns[np.newaxis, :])
-    for i, row in enumerate(rows):
-        for j, column in enumerate(columns):
-            one = sweep.raw_position(np.array(row), np.array(column))
-            np.testing.assert_allclose([grid[0][i, j], grid[1][i, j]], one, rtol=1e-14)
 
 
 @pytest.mark.parametrize("sweep", [None, SKEW, POLYNOMIAL, PROJECTIVE])

@@ -152,25 +152,6 @@ def test_false_alarms_come_at_the_stated_rate_on_an_uneven_background(name, leve
         assert low - 6 <= uneven.locate(counts).detected.sum() <= high + 6
 
 
-@pytest.mark.parametrize(
-    "other",
-    [
-        {"pulse": Pulse.gaussian(2 * FWHM)},
-        {"background": np.linspace(1, 2, BINS)},
-        {"min_photons": 5.0},
-        {"false_alarm_rate": 0.0124},
-    ],
-    ids=str,
-)
-def test_a_threshold_is_that_of_its_settings(other):
-    usual = {"pulse": Pulse.gaussian(FWHM), "bin_width": BIN, "bins": BINS}
-    first, again, differs = (
-        PhotonDetector(**{**usual, "false_alarm_rate": 0.0123, **own}).threshold(7)
-        for own in ({}, {}, other)
-    )
-    assert first == again != differs
-
-
 def test_what_pixels_have_in_common_is_background_but_a_wall_is_not():
     noise, time = np.random.default_rng(1), np.arange(256)
     dark = 0.2 * (1 + 4 * np.exp(-time / 30))

@@ -209,13 +209,6 @@ def test_views_of_a_known_picture_are_those_of_the_scene(layers):
     assert np.mean((seen == 0) == draw_view(0.0, -2.0)[1]) > 0.99
 
 
-def test_a_matrix_of_views_matches_its_adjoint():
-    warp = make_view_warp(LABELS, SHEARS, [(0.0, 1.0), (-2.0, 0.5)])
-    random = np.random.default_rng(0)
-    x, y = random.random((SIDE, SIDE), np.float32), random.random((2, SIDE, SIDE), np.float32)
-    assert np.vdot(warp(x), y) == pytest.approx(np.vdot(x, warp.H(y)), rel=1e-4)
-
-
 def test_one_picture_for_all_depths_is_better_than_any_refocused_one(measurement, layers):
     found = recover_on_depth_map(measurement, SHEARS[LABELS], weight=3e-4)
     plain = ClipRecovery(weight=1e-2)

@@ -258,20 +258,6 @@ def test_focus_measures_know_a_ramp_an_edge_and_their_shapes():
     assert compute_modified_laplacian(point)[2, 2] == 4
 
 
-def test_labels_are_the_cheapest_and_those_without_a_preference_follow_their_neighbours():
-    costs = np.random.default_rng(0).random((4, 6, 7))
-    np.testing.assert_array_equal(find_smooth_labels(costs, 0.0), costs.argmin(axis=0))
-    # On a chain belief propagation is exact: compare with every possible labelling.
-    costs = np.random.default_rng(3).random((3, 1, 6)).astype(np.float32)
-    every = np.array(np.meshgrid(*[range(3)] * 6, indexing="ij")).reshape(6, -1)
-    own = costs[every, 0, np.arange(6)[:, np.newaxis]].sum(axis=0)
-    totals = own + 0.2 * np.abs(np.diff(every, axis=0)).sum(axis=0)
-    np.testing.assert_array_equal(find_smooth_labels(costs, 0.2)[0], every[:, totals.argmin()])
-    costs = np.zeros((3, 12, 12))
-    costs[:2, 4:8, 4:8] = 1
-    assert (find_smooth_labels(costs, 0.1) == 2).all()
-
-
 TWO = np.array([0.0, 1.0])
 
 

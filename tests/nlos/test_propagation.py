@@ -2,7 +2,6 @@
 against the definition or the direct sum; and the plane that the hybrid method chooses.
 """
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -93,19 +92,6 @@ def test_propagation_in_time_arrives_at_the_same_field_and_grows_exact_with_fine
     # Errors of linear interpolation fall with the square of the bins' width.
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.2)
     assert errors[1] / errors[2] == pytest.approx(4, rel=0.2)
-
-
-@pytest.mark.parametrize("propagation", ["spectral", "time"])
-def test_pieces_of_a_wall_add_up(propagation):
-    capture = see_shaped("plates", 15)
-    left, right = (
-        replace(capture, wall=np.where((capture.wall[..., :1] < 0) == side, capture.wall, np.nan))
-        for side in (True, False)
-    )
-    whole, *parts = (
-        propagate(some, PLANE, PULSE, propagation).values for some in (capture, left, right)
-    )
-    assert relative_error(parts[0] + parts[1], whole) < 1e-5
 
 
 # --- by Fourier transforms

@@ -6,7 +6,6 @@ from numpy.linalg import norm
 from PIL import Image
 from scenes import curved_wall, planar_wall, see
 
-import nlos.video
 from nlos import Capture, Grid, Hybrid, PlanarRSD, TransientImaging
 from nlos.capture import TimeAxis
 from nlos.method import MEMORY_LIMIT_BYTES
@@ -61,18 +60,6 @@ def test_every_voxel_at_its_own_time_is_the_image_of_the_method(method):
     image = METHODS[method].reconstruct(capture, GRID).values
     for i, voxel in enumerate(voxels):
         assert values[(i, *voxel)] == pytest.approx(image[voxel], abs=1e-2 * float(image.max()))
-
-
-def test_front_views_are_the_brightest_along_z(monkeypatch):
-    monkeypatch.setattr(nlos.video, "INSTANTS_PER_BLOCK", 3)  # 7 instants in three pieces
-    imaging, capture = TransientImaging(METHODS["hybrid"]), seen("hybrid")
-    times = np.linspace(ARRIVALS[0], ARRIVALS[1], 7)
-    front, whole = imaging.front_views(capture, GRID, times), imaging.video(capture, GRID, times)
-    assert front.values.shape == (7, 17, 17)
-    np.testing.assert_allclose(front.values, whole.values.max(axis=1), rtol=1e-5)
-    for i, point in ((0, POINTS[0]), (6, POINTS[1])):
-        _, y, x = GRID.find_nearest(point)
-        assert np.unravel_index(front.values[i].argmax(), front.values[i].shape) == (y, x)
 
 
 @pytest.mark.parametrize("method", METHODS)
