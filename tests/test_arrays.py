@@ -16,17 +16,11 @@ import pytest
 from tofclip import arrays
 from tofclip.arrays import (
     ComputeDevice,
-    PerDevice,
-    as_type,
-    clip_values,
-    empty_aligned,
     is_numpy,
     namespace,
     parse_device,
     require_numpy,
-    scalar_like,
     to_numpy,
-    zeros,
 )
 from tofclip.camera import Camera
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
@@ -78,14 +72,6 @@ class TestDevice:
         sums = to_numpy(namespace(there).sum(there, axis=0))
         np.testing.assert_allclose(sums, VALUES.sum(axis=0))
 
-    def test_values_beyond_a_limit_are_replaced_by_it(self, device):
-        values = np.array([-2.0, 0.5, 3.0], np.float32)
-        for limits in ((0.0, 1.0), (0.0, None), (None, 1.0)):
-            found = to_numpy(clip_values(device.put(values), *limits))
-            np.testing.assert_array_equal(found, np.clip(values, *limits))
-            assert found.dtype == np.float32
-        assert type(clip_values(values, 0.0)) is np.ndarray
-
     def test_numpy_is_the_place_of_numpys_arrays_lists_and_numbers(self, device):
         assert all(is_numpy(values) for values in (VALUES, VALUES[0, 0], [1.0, 2.0], 3))
         assert ComputeDevice.of(VALUES) == ComputeDevice() == parse_device("cpu")
@@ -99,34 +85,6 @@ class TestDevice:
         require_numpy("the search", VALUES, [1.0])
         with pytest.raises(InputError, match="the search works on NumPy arrays, not on"):
             require_numpy("the search", VALUES, device.put(VALUES))
-
-    def test_types_are_changed_where_the_array_is(self, device):
-        there = device.put(VALUES)
-        assert as_type(there, np.float32) is there
-        double = as_type(there, np.float64)
-        assert ComputeDevice.of(double) == device
-        assert to_numpy(double).dtype == np.float64
-        np.testing.assert_array_equal(to_numpy(double), VALUES)
-        turned = as_type(VALUES.T, np.float64)
-        assert turned.flags.c_contiguous
-        np.testing.assert_array_equal(turned, VALUES.T)
-
-    def test_zeros_and_numbers_are_like_what_they_are_for(self, device):
-        for like in (VALUES, device.put(VALUES)):
-            nothing, number = zeros((2, 1), like), scalar_like(1.5, like)
-            assert ComputeDevice.of(nothing) == ComputeDevice.of(like)
-            assert to_numpy(nothing).dtype == to_numpy(number).dtype == VALUES.dtype
-            np.testing.assert_array_equal(to_numpy(nothing), [[0], [0]])
-            assert ComputeDevice.of(number).library == ComputeDevice.of(like).library
-            least = to_numpy(namespace(like).minimum(like, number))
-            np.testing.assert_array_equal(least, np.minimum(VALUES, 1.5))
-
-    def test_what_is_set_up_in_a_place_is_set_up_once(self, device):
-        asked = []
-        copies = PerDevice(lambda where: asked.append(where) or where.put(VALUES))
-        for array in (device.put(VALUES), VALUES, device.put(VALUES[0])):
-            assert ComputeDevice.of(copies.get(array)) == ComputeDevice.of(array)
-        assert asked == [device, ComputeDevice()]
 
     def test_a_place_says_where_it_is(self, device):
         assert str(ComputeDevice()) == "cpu"
@@ -169,14 +127,6 @@ class TestDevice:
         for name in ("cuda", "cuda:1", "torch:cuda:99", "torch:nonsense"):
             with pytest.raises(MissingDependencyError, match='use `device="cpu"`'):
                 parse_device(name)
-
-    @pytest.mark.parametrize("shape", [(3, 5), (1000, 17), (1,)])
-    def test_aligned_arrays_begin_a_cache_line(self, shape):
-        for dtype in (np.float32, np.float64):
-            made = [empty_aligned(shape, dtype) for _ in range(5)]
-            assert all(one.ctypes.data % 64 == 0 for one in made)
-            assert all(one.shape == shape and one.dtype == dtype for one in made)
-            assert all(one.flags.c_contiguous and one.flags.writeable for one in made)
 
 
 def test_frames_of_other_libraries_are_checked_and_saved(device, tmp_path):

@@ -82,6 +82,7 @@ def test_what_has_compiled_loops_only_says_so(shell):
     assert shell.figures(f"{line} auto")["device"] == "cpu"
 
 
+@pytest.mark.nightly
 def test_the_name_travels_with_a_folders_jobs(shell, curved):
     words = "--out volumes --voxel-mm 80 --device torch:cpu"
     shell.figures(f"nlos reconstruct {{curved.parent}} {words}")

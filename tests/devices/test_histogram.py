@@ -12,7 +12,6 @@ from devices.linospad2 import (
     CLOCK_PERIOD_S,
     CODES_PER_PERIOD,
     STAMP_DTYPE,
-    STAMP_WITH_COUNTER_DTYPE,
     BoardCalibration,
 )
 from devices.timetag_codec import DELTA, RECORD_DTYPE
@@ -121,26 +120,6 @@ def test_even_light_gives_even_bins_whatever_the_codes(board):
     # 50 bins' own scatter.
     assert np.std(corrected.counts[:, 40]) < 1.3 * np.sqrt(mean)
     assert corrected.counts[:, 40].sum() == pytest.approx(photons, rel=1e-6)
-
-
-def test_stamps_with_a_counter_and_in_pieces(board, monkeypatch):
-    random = np.random.default_rng(9)
-    pixels = random.integers(0, 256, 200_000)
-    plain = np.zeros(200_000, STAMP_DTYPE)
-    plain["pixel"], plain["code"] = pixels, random.integers(0, 1 << 20, 200_000)
-    counted = np.zeros(200_000, STAMP_WITH_COUNTER_DTYPE)
-    for name in STAMP_DTYPE.names or ():
-        counted[name] = plain[name]
-    axis = BinAxis(20 * PS, 576, 0.0, 25e-9)
-    monkeypatch.setenv(THREADS_VARIABLE, "1")
-    whole = StampHistogram(axis, board)
-    whole.add(plain)
-    monkeypatch.setenv(THREADS_VARIABLE, "3")
-    pieces = StampHistogram(axis, board)
-    pieces.add(counted[:150_000])
-    pieces.add(counted[150_000:])
-    # The order of additions in float64.
-    assert_allclose(pieces.counts, whole.counts, atol=1e-6)
 
 
 def tags(rows):

@@ -70,8 +70,3 @@ def test_values_of_an_address_are_read():
     assert Uri.parse("tcp://[::1]").host_and_port(5) == ("::1", 5)
     assert (uri.value("seed", int, 0), uri.value("absent", int, 7)) == (4, 7)
     assert uri.choice("mode", "a", "b") == "a"
-
-
-def test_accounts_balance_or_do_not():
-    assert Stats(15, 1, 2, 3, 4, 5).is_balanced
-    assert not Stats(16, 1, 2, 3, 4, 5).is_balanced

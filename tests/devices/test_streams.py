@@ -2,9 +2,7 @@
 instrument's clock estimated from messages that are delayed, and a connection that misbehaves.
 """
 
-import dataclasses
 import resource
-import threading
 import time
 from pathlib import Path
 
@@ -106,45 +104,6 @@ class RingMachine(RuleBasedStateMachine):
 
 TestRing = RingMachine.TestCase
 TestRing.settings = settings(stateful_step_count=30)
-
-
-def test_a_writer_waits_for_room_or_the_end():
-    ledger = Ledger()
-    ring = RingBuffer(10, "block", ledger)
-    ring.put(Piece(b"0" * 10, 1))
-    for free in (lambda: ring.get(SOON), ring.end):
-        writer = threading.Thread(target=ring.put, args=(Piece(b"1" * 10, 1),))
-        writer.start()
-        writer.join(SOON)
-        assert writer.is_alive()
-        free()
-        writer.join(LONG)
-        assert not writer.is_alive()
-    assert ledger.stats.dropped_host == 0
-    assert [ring.get(SOON) is not None for _ in range(3)] == [True, True, False]
-
-
-def test_changes_at_the_same_time_all_count(monkeypatch):
-    """Another thread gets its turn between reading the accounts and writing them."""
-
-    def replace_slowly(stats, **changes):
-        time.sleep(1e-3)
-        return dataclasses.replace(stats, **changes)
-
-    monkeypatch.setattr("devices.source.replace", replace_slowly)
-    ledger, started = Ledger(), threading.Barrier(4)
-
-    def enter():
-        started.wait()
-        for _ in range(5):
-            ledger.receive(1)
-
-    threads = [threading.Thread(target=enter) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert ledger.stats.acquired == ledger.stats.unread == 20
 
 
 @pytest.mark.parametrize("method", ["pull", "close"])

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from instruments import TAGS, finish, joined, make_tagger, read_until_dark, true_records
+from instruments import finish, joined, make_tagger, read_until_dark, true_records
 from numpy.testing import assert_allclose, assert_array_equal
 
 import devices
@@ -18,17 +18,13 @@ from devices.emulation.scenes import simulate_line_light
 from devices.emulation.timetag import (
     BOARD_MEMORY_BYTES,
     CLOCK_HZ,
-    MAX_TICK,
     PERIOD_TICKS,
     SCENE_SCALE,
     EmulatedTimeTagger,
-    PoissonStream,
     PulsedSceneStream,
 )
 from devices.emulation.usb import VirtualUsb, make_usb_error
-from devices.source import as_bytes
 from devices.timetag import (
-    DATA_ENDPOINT,
     USB_IDENTITY,
     Capture,
     Register,
@@ -67,17 +63,6 @@ def compiled():
     assert len(true_records(1, 10)) == 10
 
 
-def test_photons_are_poisson():
-    words = PoissonStream(RATE, CLOCK_HZ, 8).next_words(200_000, MAX_TICK)
-    records = TAGS.decode(as_bytes(words), TAGS.start).records
-    gaps = np.diff(records["time_ticks"])
-    # Ten ticks per photon, geometrically distributed; five standard deviations of 200 000.
-    assert abs(gaps.mean() - 10) < 0.11
-    assert abs(gaps.std() - np.sqrt(90)) < 0.2
-    shares = np.bincount(records["channels"], minlength=9)[[1, 2, 4, 8]] / len(records)
-    assert_allclose(shares, 0.25, atol=0.005)  # four standard deviations
-
-
 def test_photons_come_when_they_are_due():
     rate, seconds = 1e6, 0.3
     with devices.open(f"{SMALL}&pace=realtime&rate={rate}") as source:
@@ -108,13 +93,6 @@ def test_a_full_memory_loses_photons_and_says_so():
 def test_odd_answers_are_refused(length, said):
     with pytest.raises(ProtocolError, match=said):
         make_tagger(_send_reply=lambda *_: length).open_driver()
-
-
-def test_a_clock_that_cannot_be_is_refused():
-    instrument = make_tagger()
-    instrument._registers[Register.CLOCK] = 42
-    with pytest.raises(ProtocolError, match="42 Hz, which cannot be"):
-        instrument.open_driver()
 
 
 @pytest.mark.parametrize("fault", ["unplug@1:2", "powerloss@1:2", "overflow@1"])
@@ -207,25 +185,6 @@ def test_a_full_stream_takes_few_transfers():
     assert source.stats.malformed == 0
     assert source.stats.acquired == instrument.truth.registered
     assert source.stats.delivered / instrument._transfers > 2000
-
-
-@pytest.mark.parametrize("silent", [0, 1, 2])
-def test_records_of_the_last_session_are_thrown_away_though_they_come_slowly(silent):
-    """One request for them is not answered in time."""
-
-    class Slow(EmulatedTimeTagger):
-        requests = 0
-
-        def fill(self, endpoint, buffer, timeout):
-            if endpoint == DATA_ENDPOINT:
-                self.requests += 1
-                if self.requests == silent + 1:
-                    raise make_usb_error(errno.ETIMEDOUT)
-            return super().fill(endpoint, buffer, timeout)
-
-    instrument = make_tagger(Slow, transfer_kib=4, records=RECORDS, **OLD)
-    ticks = read_all(instrument)["time_ticks"]
-    assert_array_equal(ticks, true_records(1, RECORDS)["time_ticks"])
 
 
 @pytest.mark.parametrize("number", range(12))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from viewer_scenes import PlaneSource, column, plane
+from viewer_scenes import PlaneSource, column
 
 from apps.viewer.look import (
     PALETTE_SIZE,
@@ -22,10 +22,8 @@ from apps.viewer.look import (
     find_point_on_ray,
     format_length,
     list_quantities,
-    load_palette,
     make_scale,
     project_front,
-    render_pictures,
 )
 from apps.viewer.panels import bind_user_input, mark_times
 from apps.viewer.points import MIN_DRAWN_POINTS, DetailChooser
@@ -68,22 +66,6 @@ def test_a_loop_runs_through_the_frames_that_are_left_at_their_own_pace():
     # In the middle of each frame's tenth of a second.
     due = [clock.tick(0.05 + number / 10) for number in range(15)]
     assert due == [4 + number % 6 for number in range(15)]
-
-
-def test_steps_and_jumps_stay_among_the_frames_that_are_left():
-    clock = PlaybackClock(10.0, lambda: range(5))
-    clock.jump(3)
-    clock.play()
-    clock.step(-1)
-    assert (clock.frame, clock.playing) == (2, False)
-    clock.step(10)
-    assert clock.frame == 4
-    clock.frames = lambda: range(6, 20)
-    assert clock.tick(0.0) == 6
-    clock.jump(-7)
-    assert clock.frame == 6
-    clock.follow()
-    assert clock.tick(0.0) == 19
 
 
 @given(st.floats(0, 1e3), st.integers(1, 50), st.lists(st.floats(0, 1e4), min_size=2, max_size=6))
@@ -174,17 +156,6 @@ def test_filters_keep_what_lies_within_all_limits():
         Filters({"y": (1, 0)})
 
 
-@given(st.integers(0, 399), st.tuples(*[st.floats(-3, 3)] * 2), st.floats(-3, 1))
-def test_a_ray_at_a_point_finds_it(number, aside, back):
-    cloud, eye = plane(400), np.array([*aside, back])
-    found = find_point_on_ray(cloud.xyz, eye, cloud.xyz[number] - eye)
-    seen, aimed = cloud.xyz[found] - eye, cloud.xyz[number] - eye
-    # Another point may lie within the reach of a click and nearer; it is never further off than
-    # that.
-    angle = np.linalg.norm(np.cross(seen, aimed)) / (np.linalg.norm(seen) * np.linalg.norm(aimed))
-    assert angle < 0.0041
-
-
 def test_the_point_in_front_is_meant_and_a_miss_means_none():
     xyz = column([2.0, 1.0, 3.0]).xyz
     for origin, direction, hit in (
@@ -273,36 +244,6 @@ def test_an_arm_that_sticks_out_is_in_the_first_picture(aspect):
     square = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.9)], axis=1)
     xyz = np.concatenate([square, arm]).astype(np.float32)
     assert find_inside(xyz, xyz, aspect).all()
-
-
-@pytest.mark.parametrize("aspect", [0.6, 0.9, 1.6])
-def test_the_scale_bar_is_in_the_first_picture(aspect):
-    """Also of a deep cloud whose wide part is far away, so that the bar's place is the lowest."""
-    random = np.random.default_rng(0)
-    far = random.uniform((-0.5, -0.5, 3.0), (0.5, 0.5, 3.01), (400, 3))
-    near = random.uniform((-0.05, -0.05, 1.0), (0.05, 0.05, 1.01), (400, 3))
-    xyz = np.concatenate([far, near]).astype(np.float32)
-    # its length is written below
-    assert find_inside(
-        Box.around(xyz).scale_bar(place_viewpoint(xyz, aspect).eye), xyz, aspect, floor=0.97
-    ).all()
-
-
-def test_panes_have_a_handy_size_and_dark_holes():
-    scale = Session(PlaneSource()).frame_at(0.0).scale
-    for name, image in render_pictures(project_front(plane(4000)), scale).items():
-        assert (image.dtype, image.shape) == (np.uint8, (128, 128, 3)), name
-    of_heights = Scale("height", "m", "inferno", scale.values)
-    empty = render_pictures(project_front(plane(40)), of_heights)["depth"]
-    layer = {"2 depth": project_front(plane(40))["depth"]}
-    np.testing.assert_array_equal(render_pictures(layer, of_heights)["2 depth"], empty)
-    holes = (empty == (32, 36, 44)).all(axis=-1)
-    assert holes.mean() > 0.9
-    # ranges have the colours of ranges: one end of inferno looks like a hole
-    assert {*map(tuple, empty[~holes].tolist())} <= {*map(tuple, load_palette("viridis").tolist())}
-    for shape, sides in (((1016, 1344), (339, 336)), ((32, 16), (192, 96))):
-        pane = render_pictures({"streak": np.ones(shape, np.float32)}, scale)["streak"]
-        assert pane.shape[:2] == sides
 
 
 def test_a_camera_with_few_pixels_leaves_no_seams_in_the_panes():
