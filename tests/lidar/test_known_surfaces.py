@@ -22,14 +22,14 @@ def recover(scene, photons):
     return frames, shot.score(*place, cloud.range, cloud.range_sigma, cloud.false_alarm)
 
 
-# Twice of what seeds 0 and 2 have: 0.016, 0.06 and 0.06 mm; 0.025, 0.0003 and 0.8 mm; seed 2 of the
-# table 0.037, 0.005 and 1.4 mm, where a melon and a book that touch its top are surfaces of their own.
+# Twice of what seeds 0 and 2 have: 0.002, 0.019 and 0.06 mm; 0.025, 0.0003 and 0.8 mm; seed 2 of the
+# table 0.004, 0.001 and 0.5 mm, where a melon and a book that touch its top are surfaces of their own.
 @pytest.mark.parametrize(
     ("scene", "missed", "false", "too_small", "too_large"),
     [
-        ("wires", 0.03, 0.06, 2.0, 0.13),
+        ("wires", 0.03, 0.04, 2.0, 0.13),
         pytest.param("room", 0.05, 0.01, 1.9, 0.33, marks=pytest.mark.nightly),
-        pytest.param("table", 0.08, 0.01, 2.7, 0.3, marks=pytest.mark.nightly),
+        pytest.param("table", 0.04, 0.01, 2.7, 0.3, marks=pytest.mark.nightly),
     ],
 )
 def test_dim_and_small_things_are_seen_beside_bright_ones(
@@ -57,11 +57,11 @@ def test_dim_and_small_things_are_seen_beside_bright_ones(
     # of what seed 2 has and half of it, but 2.60 of an apple that is 10 px wide
     assert too_large < min(score["z"].values()), score["z"]
     assert max(score["z"].values()) < too_small, score["z"]
-    # none is without a probability of being false, and few that seem sure are: 0.04 of wires, where
-    # light may lie anywhere along a level line, and 0 of the others
+    # none is without a probability of being false, and none that seems sure is: of wires, whose light
+    # may lie anywhere in a lens about a level line, it was 0.04 while nothing said that it may
     stated = {low: (true, count) for low, _, _, true, count in score["calibration"]}
     assert sum(count for _, count in stated.values()) == score["counted"].sum()
-    assert stated[0.0][0] < 0.06
+    assert stated[0.0][0] < 0.005
     assert stated[0.0][1] > 0.8 * score["counted"].sum()
 
 
@@ -82,9 +82,9 @@ def test_a_wall_that_goes_on_beyond_the_picture_is_not_tilted():
 def test_leaves_are_kept_in_little_light():
     """Those too small for a surface are the frames' returns, which the whole shot shows to be there."""
     _, score = recover("bush", 200)
-    # 0.11; 0.16 where each had to stand ten deviations out of the noise
-    assert score["miss"] < 0.13
-    assert score["false"] < 0.005
+    # 0.09 and 0.009; 0.16 missed where each had to stand ten deviations out of the noise
+    assert score["miss"] < 0.12
+    assert score["false"] < 0.015
 
 
 def test_a_dark_shot_is_called_dark():

@@ -480,16 +480,15 @@ def test_what_steps_take_from_the_misfit_is_given_back():
         noise = draw.standard_normal((rows, columns)).astype(np.float32)
         change = inverse @ (flat @ noise.ravel())
         left = noise - np.tensordot(change.astype(np.float32), images, 1)
-        found = NormalEquations.multiply([group], weights, left, left)
+        found = NormalEquations.multiply([group], weights, left)
         np.testing.assert_allclose(found.normal, flat @ flat.T, rtol=1e-4, atol=0.1)
         np.testing.assert_allclose(found.slope, 0, atol=0.1)
-        stated += np.diag(found.estimate_covariances(inverse, np.zeros((7, 7)))) / draws
+        stated += np.diag(found.estimate_covariances(inverse, np.zeros((7, 7)), left)) / draws
         scores = np.array(
             [
                 images[:, top : top + CLUSTER_ROWS, side : side + CLUSTER_COLUMNS].reshape(7, -1)
                 @ left[top : top + CLUSTER_ROWS, side : side + CLUSTER_COLUMNS].ravel()
-                for top in range(0, rows, CLUSTER_ROWS)
-                for side in range(0, columns, CLUSTER_COLUMNS)
+                for top, side in found.clusters
             ]
         )
         plain += np.diag(inverse @ (scores.T @ scores) @ inverse) / draws

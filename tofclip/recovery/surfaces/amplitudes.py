@@ -152,12 +152,17 @@ class AmplitudeSolver:
         so many deviations, `noise`, where it is dark, but no more than the brightest is out of the noise
         itself: in little light nothing would be left.
         """
+        bright, brightest = self.compare_places()
+        usual = np.maximum(np.float32(DIM_PART) * brightest, TINY)
+        dim = np.clip(1 - bright / usual, 0, 1)
+        return np.asarray(dim * noise * np.minimum(np.float32(sigmas), noise * usual))
+
+    def compare_places(self) -> tuple[Image, Image]:
+        """How bright the place of each point is, and the brightest of its surface beside it."""
         mean = partial(scipy.ndimage.uniform_filter, size=PLACE_PX, mode="constant")
         largest = partial(scipy.ndimage.maximum_filter, size=BESIDE_PX, mode="constant")
         bright = self.map_pictures(mean, self.amplitude)
-        usual = np.maximum(np.float32(DIM_PART) * self.map_pictures(largest, bright), TINY)
-        dim = np.clip(1 - bright / usual, 0, 1)
-        return np.asarray(dim * noise * np.minimum(np.float32(sigmas), noise * usual))
+        return bright, self.map_pictures(largest, bright)
 
     def _estimate_norms(self) -> FloatArray:
         """Largest eigenvalue of A'WA for each surface, by power iteration."""
@@ -223,6 +228,15 @@ def estimate_excess_variance(model: SurfaceModel, amplitude: Image) -> float:
     if not lit.any():
         return 1.0
     return float(np.mean(model.weights[lit] * (predicted - model.image)[lit] ** 2))
+
+
+def share_misfit(model: SurfaceModel, amplitude: Image, misfit: Image) -> Image:
+    """Give each point its part of a misfit, or a change of one, (rows, columns): each measurement's
+    belongs to the points whose light it is.
+    """
+    light = np.maximum(model.render(amplitude), np.float32(LEAST_COUNT))
+    relative: Image = (misfit / light).astype(np.float32)
+    return amplitude * model.gather(relative)
 
 
 def scale_amplitude(model: SurfaceModel, lit: NDArray[np.bool_]) -> Image:

@@ -18,7 +18,7 @@ from tofclip.arrays import FloatArray
 from tofclip.errors import InputError
 from tofclip.lidar import Detection, depth
 from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
-from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver, Tick
+from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, Tick, share_misfit
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.patches import find_dimmer_patches, rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
@@ -255,14 +255,12 @@ def straighten_surfaces(
         return solver, None
     ahead = copy.copy(model)
     before, straight = refine_state(ahead, solver.amplitude), bent
-    # whose light it is says to which surface a change of the misfit belongs
-    light = np.maximum(model.render(solver.amplitude), np.float32(LEAST_COUNT))
     while straight:
         trial = model.straighten(straight, solver.amplitude)
         # what amplitudes explain hardly depends on the basis: begun there, but still a first step
         after = refine_state(trial, solver.amplitude, replace(before, steps=0))
-        change = ((after.rest**2 - before.rest**2) / light).astype(np.float32)
-        excess = solver.amplitude * model.gather(model.weights * change)
+        change = model.weights * (after.rest**2 - before.rest**2)
+        excess = share_misfit(model, solver.amplitude, change)
         needed = []
         for surface in straight:
             basis, coefficients = ahead.bases[surface], ahead.state.coefficients[surface]
@@ -318,7 +316,7 @@ def _find_others(
     surfaces and all other returns free to take over their light; and the light of all.
     """
     model = solver.model
-    chosen, _ = find_candidates(solver, Detection.signal_to_noise)
+    chosen = find_candidates(solver, solver.measure_significance(), Detection.signal_to_noise)
     points = model.row[chosen], model.column[chosen], model.distance[chosen]
     near = find_near((found.y, found.x, found.range), points, model.row_m)
     others = found[~near]
@@ -384,15 +382,16 @@ def find_near(places: Places, others: Places, bin_m: float) -> NDArray[np.bool_]
     return np.asarray(np.isfinite(away))
 
 
-def find_candidates(solver: AmplitudeSolver, limit: float) -> tuple[NDArray[np.bool_], Image]:
-    """Say which points stand out of the noise and are not far fainter than their surface; and by how
-    many standard deviations all do.
+def find_candidates(
+    solver: AmplitudeSolver, significance: Image, limit: float
+) -> NDArray[np.bool_]:
+    """Say which points stand out of the noise, by their significance, and are not far fainter than
+    their surface.
     """
     model, amplitude = solver.model, solver.amplitude
-    significance = solver.measure_significance()
     usual = [find_usual_brightness(amplitude[p], significance[p], limit) for p in model.parts]
     faint = amplitude <= MIN_BRIGHTNESS_FRACTION * np.array(usual)[model.surface]
-    return (significance > limit) & ~faint, significance
+    return np.asarray((significance > limit) & ~faint)
 
 
 def find_usual_brightness(amplitude: Image, significance: Image, limit: float) -> float:

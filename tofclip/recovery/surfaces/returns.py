@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from functools import partial
 from typing import Any
 
@@ -12,7 +13,15 @@ from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.lidar import Detection
 from tofclip.lidar.range_calibration import correct_returns
-from tofclip.recovery.surfaces.fit import SURE_SIGMAS, SurfaceFit, find_candidates, find_near
+from tofclip.lidar.search import number_returns
+from tofclip.recovery.surfaces.amplitudes import NEIGHBOURHOOD_PX, share_misfit
+from tofclip.recovery.surfaces.fit import (
+    NEAR_BINS,
+    SURE_SIGMAS,
+    SurfaceFit,
+    find_candidates,
+    find_near,
+)
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.patches import rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
@@ -22,11 +31,14 @@ from tofclip.shots import Returns
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
-# Logarithm of the odds that a surface's point is false: nothing known, for each e-fold over 20 of its
-# significance where dim light beside bright is costly, and where the frames have returns beside all
-# points about it. From scenes of known returns (tests/lidar/physics_scenes.py); docs tell what they miss.
-FALSE_ODDS = np.array([0.72, -0.78, -4.63])
-LEAST_SIGMAS = 0.1  # a significance of less counts as that
+# Logarithm of the odds that a surface's point is false: nothing known, for each e-fold over 20 of the
+# deviations by which the shot needs it, where the frames have returns beside all points about it, for
+# each e-fold of the part of its surface's light that may as well lie elsewhere, for each by which its
+# place is as bright as the brightest beside it, and where something lies before it. From scenes of
+# known returns (tests/lidar/physics_scenes.py, apps/studies/surfaces.py); docs tell what they miss.
+FALSE_ODDS = np.array([5.6, -0.46, -4.29, 2.05, -0.80, 0.79])
+# Less, and of light elsewhere more, makes no difference.
+LEAST_SIGMAS, LEAST_ELSEWHERE, MOST_ELSEWHERE, LEAST_BRIGHT = 0.1, 0.02, 0.2, 0.01
 ABOUT_PX = 5  # side of the square
 
 # Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
@@ -88,12 +100,12 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
         beside = getattr(others, name)
         columns[name] = np.concatenate([column.astype(beside.dtype), beside])
     pixel = columns["y"].astype(np.intp) * camera.image_shape[1] + columns["x"]
-    order, rank = rank_within_pixels(pixel, columns["range"])
+    order = np.lexsort((columns["range"], pixel))
     columns = {name: column[order] for name, column in columns.items()}
     return correct_returns(
         Returns(
             **columns,
-            return_number=(rank + 1).astype(np.uint8),
+            return_number=number_returns(pixel[order]),
             camera=camera,
             shear=np.asarray(camera.shear_at(columns["range"])),
         )
@@ -115,17 +127,61 @@ def estimate_hidden_shift(model: SurfaceModel, amplitude: Image) -> FloatArray:
 
 def _judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
     """Numbers of the candidates among the points, and how probable it is that each is false."""
-    solver, model, seen = fit.solver, fit.solver.model, fit.seen
-    shown, _ = find_candidates(solver, limit)
-    significance = fit.sparse.measure_significance(solver.estimate_local_variance())[shown]
+    shown, known = _gather_evidence(fit, limit)
+    return shown, scipy.special.expit(FALSE_ODDS[0] + FALSE_ODDS[1:] @ known)
+
+
+def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
+    """Numbers of the candidates among the points, and what `FALSE_ODDS` weighs of each, (5, candidates)."""
+    solver, sparse, model, seen = fit.solver, fit.sparse, fit.solver.model, fit.seen
+    variance = solver.estimate_local_variance()
+    shown = find_candidates(solver, solver.measure_significance(variance), limit)
+    before, after = ((model.image - model.render(one.amplitude)) ** 2 for one in (solver, sparse))
+    worse = share_misfit(model, solver.amplitude, model.weights / variance * (after - before))
+    place = partial(scipy.ndimage.uniform_filter, size=NEIGHBOURHOOD_PX, mode="constant")
+    worse = np.maximum(NEIGHBOURHOOD_PX**2 * solver.map_pictures(place, worse), 0)
+    # Where dim light is costly, a point is needed by the light that stays there, on whichever surface, and
+    # by how much worse the shot is explained without what does not.
+    stays = _add_up_near(model, sparse.amplitude)
+    stays /= np.maximum(_add_up_near(model, solver.amplitude), TINY)
+    sparse = copy.copy(sparse)
+    sparse.amplitude = (stays * solver.amplitude).astype(np.float32)
+    needed = np.sqrt(sparse.measure_significance(variance) ** 2 + worse)
+    # Light of a line of one range may lie anywhere in a lens about it: of such a surface the two
+    # explanations are unlike where they are as probable.
+    moved = np.maximum(solver.amplitude - sparse.amplitude, 0) * np.exp(-worse / 2)
+    lost, light = (
+        np.bincount(model.surface, one, len(model.parts)) for one in (moved, solver.amplitude)
+    )
+    elsewhere = np.clip(lost / np.maximum(light, TINY), LEAST_ELSEWHERE, MOST_ELSEWHERE)
+    bright, brightest = sparse.compare_places()
+
     points = model.row[shown], model.column[shown], model.distance[shown]
     candidates, confirmed = shown.astype(np.float64), np.zeros(shown.size)
     confirmed[shown] = find_near(points, (seen.y, seen.x, seen.range), model.row_m)
     mean = partial(scipy.ndimage.uniform_filter, size=ABOUT_PX, mode="constant")
     about, near = (solver.map_pictures(mean, one)[shown] for one in (confirmed, candidates))
-    known = [np.log(np.maximum(significance, LEAST_SIGMAS) / SURE_SIGMAS), about / near]
-    odds = FALSE_ODDS[0] + FALSE_ODDS[1:] @ np.array(known)
-    return np.flatnonzero(shown), scipy.special.expit(odds)
+    nearest, pixel = np.full(model.masks[0].size, np.inf), model.pixel[shown]
+    np.minimum.at(nearest, pixel, model.distance[shown])
+    behind = model.distance[shown] > nearest[pixel] + NEAR_BINS * model.row_m
+    known = [
+        np.log(np.maximum(needed[shown], LEAST_SIGMAS) / SURE_SIGMAS),
+        about / near,
+        np.log(elsewhere)[model.surface[shown]],
+        np.log(np.maximum(bright / np.maximum(brightest, TINY), LEAST_BRIGHT))[shown],
+        behind,
+    ]
+    return np.flatnonzero(shown), np.array(known)
+
+
+def _add_up_near(model: SurfaceModel, amplitude: Image) -> FloatArray:
+    """The light that lies in each point's pixel about its range, of all surfaces."""
+    reach = NEAR_BINS * model.row_m
+    place = model.pixel * (model.distance.max() + 2 * reach) + model.distance
+    order = np.argsort(place)
+    total = np.append(0, np.cumsum(amplitude[order], dtype=np.float64))
+    first, last = (np.searchsorted(place[order], place + away) for away in (-reach, reach))
+    return np.asarray(total[last] - total[first])
 
 
 def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
