@@ -55,6 +55,9 @@ KNOT_SPACING_PX, MAX_PIECES = 12, 8
 RETURNS_PER_UNKNOWN = 3.0  # of splines: they share their errors
 BEND_BINS = 0.3  # misfit of a quadratic from which on splines are tried
 BENT_FRACTION = 0.6  # of a quadratic's misfit: splines are worth their freedom below
+# Misfit from which on a patch may be two, also in its returns' deviations (0.67 are expected of a
+# surface's), and what is left of it where it is: with as much freedom again a ball alone has 0.5.
+CREASE_BINS, CREASE_SIGMAS, CREASE_FRACTION, CREASE_ROUNDS = 0.4, 0.67, 0.5, 8
 MIN_ROUND_PX = 50  # of a surface of second order in space: any few returns lie on one
 EVIDENCE_ROUNDS = 2
 SPLINE_START_PENALTY, SPLINE_FLOOR = 1e-5, 1e-9  # per return, before the bending is known
@@ -105,7 +108,8 @@ def find_patches(
     have several returns.
     """
     found = find_plain_patches(pixels, distance, deviation, ray_length, bin_m)
-    return [_bend_where_needed(patch, bin_m) for patch in found]
+    parts = [part for patch in found for part in _part_at_creases(patch, bin_m)]
+    return sorted(parts, key=lambda part: -part.pixels.size)
 
 
 def find_plain_patches(
@@ -280,6 +284,58 @@ def _bend_where_needed(patch: Patch, bin_m: float) -> Patch:
         quadric = replace(patch, basis=basis, coefficients=coefficients)
         bent = min(quadric, bent, key=Patch.compute_error)
     return bent if bent.compute_error() < BENT_FRACTION * plain else patch
+
+
+def _part_at_creases(patch: Patch, bin_m: float) -> list[Patch]:
+    """Bend a patch where needed; return its parts where surfaces of their own follow the returns of each
+    far better: things that touch at one range, as a ball and the cable on which it hangs, or two limbs.
+    """
+    whole = _bend_where_needed(patch, bin_m)
+    error = whole.compute_error()
+    if error < CREASE_BINS * bin_m or whole.compute_misfit(whole) < CREASE_SIGMAS:
+        return [whole]
+    y, x = np.divmod(patch.pixels, patch.ray_length.shape[1])
+    best, least = None, CREASE_FRACTION * error
+    for across in (x, y, x + y, x - y):
+        second = _part_in_two(patch, across > np.median(across), SPLIT_BINS * bin_m)
+        if min(second.sum(), (~second).sum()) < MIN_PATCH_PX:
+            continue
+        parts = [patch.take(np.flatnonzero(own)) for own in (~second, second)]
+        errors = [_bend_where_needed(part, bin_m).compute_error() for part in parts]
+        left = float(np.average(errors, weights=[part.pixels.size for part in parts]))
+        if left < least:
+            best, least = parts, left
+    if best is None:
+        return [whole]
+    return [part for half in best for part in _part_at_creases(half, bin_m)]
+
+
+def _part_in_two(patch: Patch, second: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
+    """Say which returns follow the second of two quadratics better, (n,), with those about them, from a
+    first guess on. No return counts for more than `most`, m.
+    """
+    for _ in range(CREASE_ROUNDS):
+        if min(second.sum(), (~second).sum()) < MIN_PATCH_PX:
+            break
+        fits = (patch.take(own).compute_ranges(patch.pixels) for own in (~second, second))
+        off = [
+            _average_beside(patch, np.minimum(np.abs(fit - patch.distance), most)) for fit in fits
+        ]
+        before, second = second, off[1] < off[0]
+        if (before == second).all():
+            break
+    return second
+
+
+def _average_beside(patch: Patch, values: FloatArray) -> FloatArray:
+    """Mean of values of returns, (n,), over those of the pixels about each."""
+    pictures = np.zeros((2, *patch.ray_length.shape))
+    np.add.at(pictures[0].ravel(), patch.pixels, values)
+    np.add.at(pictures[1].ravel(), patch.pixels, 1.0)
+    total, count = (
+        scipy.ndimage.uniform_filter(one, NEIGHBOURS_PX, mode="constant") for one in pictures
+    )
+    return np.asarray((total.ravel() / np.maximum(count.ravel(), TINY))[patch.pixels])
 
 
 def _give_splines(patch: Patch) -> Patch:
