@@ -127,21 +127,24 @@ def smooth_rows(images, kernel, lags, rows, below, aside, results):
             while end > tap and not (kernel[end - 1] != 0 and 0 <= source - lags[end - 1] < height):
                 end -= 1
             # Four rows at a time, as whole lines: the sums stay in registers, and an index into two
-            # dimensions would be checked for every pixel.
-            while tap + 4 <= end:
-                a, b, c, d = kernel[tap], kernel[tap + 1], kernel[tap + 2], kernel[tap + 3]
+            # dimensions would be checked for every pixel. Beyond the end rows count nothing.
+            while tap < end:
+                second, third, last = (
+                    min(tap + 1, end - 1),
+                    min(tap + 2, end - 1),
+                    min(tap + 3, end - 1),
+                )
+                a = kernel[tap]
+                b = kernel[second] if second > tap else np.float32(0)
+                c = kernel[third] if third > second else np.float32(0)
+                d = kernel[last] if last > third else np.float32(0)
                 line_a = image[source - lags[tap], left + aside :]
-                line_b = image[source - lags[tap + 1], left + aside :]
-                line_c = image[source - lags[tap + 2], left + aside :]
-                line_d = image[source - lags[tap + 3], left + aside :]
+                line_b = image[source - lags[second], left + aside :]
+                line_c = image[source - lags[third], left + aside :]
+                line_d = image[source - lags[last], left + aside :]
                 for i in range(line.size):
                     line[i] += a * line_a[i] + b * line_b[i] + c * line_c[i] + d * line_d[i]
                 tap += 4
-            while tap < end:
-                weight, other = kernel[tap], image[source - lags[tap], left + aside :]
-                for i in range(line.size):
-                    line[i] += weight * other[i]
-                tap += 1
 
 
 def prox_masked_tv(

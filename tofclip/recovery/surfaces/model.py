@@ -44,7 +44,7 @@ from tofclip.threads import map_parallel, split_blocks, thread_count
 from tofclip.units import SPEED_OF_LIGHT
 
 Result = TypeVar("Result")
-Box = tuple[slice, slice]
+Box = tuple[NDArray[np.int64], slice]  # rows, ascending, and columns
 
 MODEL_ERROR_FRACTION = 0.015  # of the brightest measurement: what the model leaves without noise
 SMOOTHING_PX = 2.0
@@ -516,7 +516,8 @@ class SurfaceModel:
         """
         lights, place = np.atleast_2d(amplitude), self.footprints[view]
         rows, columns = box = self._find_box(view, part)
-        top, bottom = place.first_row + rows.start, place.first_row + rows.stop
+        first, last = (int(rows[0]), int(rows[-1]) + 1) if rows.size else (0, 0)
+        top, bottom = place.first_row + first, place.first_row + last
         left, right = (
             min(max(place.first_column + one, 0), self.image.shape[1])
             for one in (columns.start, columns.stop)
@@ -531,16 +532,15 @@ class SurfaceModel:
         """Rows and columns of a view's picture that the light of some points reaches."""
         from tofclip.recovery.surfaces.kernels import SPLINE_SAMPLES
 
-        place, margin = self.footprints[view], self._margin
+        place = self.footprints[view]
         begin, end, _ = part.indices(self.surface.size)
         own = slice(int(self.places.starts[begin]), int(self.places.starts[end]))
         row, column = place.row[own], place.column[own]
         if not (row.size and place.lit_rows.size):
-            return slice(0, 0), slice(0, 0)
-        first = max(int(row.min()) - self.half, margin)
-        last = min(int(row.max()) + SPLINE_SAMPLES + self.half, place.shape[0] - margin)
-        left, right = int(column.min()), int(column.max()) + SLIT_PIXELS
-        return slice(first, max(last, first)), slice(left, right)
+            return place.lit_rows[:0], slice(0, 0)
+        reach = int(row.min()) - self.half, int(row.max()) + SPLINE_SAMPLES + self.half
+        own = slice(*np.searchsorted(place.lit_rows, reach))
+        return place.lit_rows[own], slice(int(column.min()), int(column.max()) + SLIT_PIXELS)
 
     def _project(
         self,
@@ -558,19 +558,17 @@ class SurfaceModel:
         from tofclip.recovery.surfaces.kernels import add_light, smooth_rows
 
         place, (rows, columns), margin = self.footprints[view], box, self._margin
-        if rows.start == rows.stop:
+        if not rows.size:
             return
-        top, left = rows.start - margin, columns.start
-        size = rows.stop + margin - top, columns.stop - left
+        top, left = int(rows[0]) - margin, columns.start
+        size = int(rows[-1]) + 1 + margin - top, columns.stop - left
         light = np.zeros((len(lights), *size), np.float32)
         begin, end, _ = part.indices(self.surface.size)
         starts, shares = self.places.starts[begin : end + 1], self._shares[view, part]
         spread = place.row, place.row_shares, place.column, place.slit_shares
         add_light(lights, shares, starts, *spread, top, left, light)
-        own = slice(*np.searchsorted(place.lit_rows, (rows.start, rows.stop)))
         below, aside = corner[0] - place.first_row, corner[1] - place.first_column
-        lit = place.lit_rows[own] - below
-        smooth_rows(light, kernel, self._lags, lit, below - top, aside - left, images)
+        smooth_rows(light, kernel, self._lags, rows - below, below - top, aside - left, images)
 
     def _trail(self, light: Image, first: int, rows: int) -> Image:
         """Some rows of light, (n, rows, columns), with its afterglow, from row `first` of it on."""
@@ -597,10 +595,9 @@ class SurfaceModel:
         def work(views: range) -> Image:
             seen = np.zeros((1, rows.stop - rows.start, self.image.shape[1]), np.float32)
             for view in views:
-                (high, wide), kernel = self.footprints[view].shape, self.kernels[view]
-                box = slice(self._margin, high - self._margin), slice(0, wide)
-                lights, corner = amplitude[np.newaxis], (rows.start, 0)
-                self._project(view, lights, kernel, slice(None), box, corner, seen)
+                place, lights = self.footprints[view], amplitude[np.newaxis]
+                box, corner = (place.lit_rows, slice(0, place.shape[1])), (rows.start, 0)
+                self._project(view, lights, self.kernels[view], slice(None), box, corner, seen)
             return seen
 
         light = reduce(np.add, self.share_out(work, self.camera.views))

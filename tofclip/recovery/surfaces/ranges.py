@@ -195,6 +195,14 @@ def _differentiate_surface(
     return [*_join_windows(model, names, windows)]
 
 
+class Cluster(NamedTuple):
+    """What some neighbouring measurements say of the unknowns."""
+
+    numbers: NDArray[np.intp]  # (n,), of the unknowns that they say anything of
+    information: Image  # (n, n), J'WJ
+    score: Image  # (n,), J'W of the misfit as it was before the step
+
+
 @dataclass(frozen=True)
 class NormalEquations:
     """What a Gauss-Newton step is made of: products of all derivatives with each other and with the
@@ -205,16 +213,18 @@ class NormalEquations:
     names: list[Unknown]
     normal: FloatArray  # (unknowns, unknowns), J'WJ
     slope: FloatArray  # (unknowns,), J'W of what is to be explained
-    # of each cluster the unknowns' numbers, and their derivatives (n, pixels)
-    clusters: dict[tuple[int, int], list[tuple[NDArray[np.intp], Image]]]
-    weights: Image
+    clusters: list[Cluster]
 
     @classmethod
-    def multiply(cls, groups: list[Derivatives], weights: Image, rest: Image) -> NormalEquations:
-        """Multiply derivatives with each other and with what is to be explained."""
+    def multiply(
+        cls, groups: list[Derivatives], weights: Image, rest: Image, error: Image
+    ) -> NormalEquations:
+        """Multiply derivatives with each other, with what is to be explained, `rest`, and with the misfit
+        as it was, `error`.
+        """
         names = list(dict.fromkeys(name for group in groups for name in group.names))
         number = {name: place for place, name in enumerate(names)}
-        clusters: dict[tuple[int, int], list[tuple[NDArray[np.intp], Image]]] = {}
+        parts: dict[tuple[int, int], list[tuple[NDArray[np.intp], Image]]] = {}
         for group in groups:
             own = np.array([number[name] for name in group.names])
             for down in range(0, group.images.shape[1], CLUSTER_ROWS):
@@ -224,63 +234,49 @@ class NormalEquations:
                     ]
                     if part.any():
                         place = group.row + down, group.column + right
-                        clusters.setdefault(place, []).append((own, part))
+                        parts.setdefault(place, []).append((own, part.reshape(own.size, -1)))
         normal, slope = np.zeros((len(names), len(names))), np.zeros(len(names))
-        equations = cls(names, normal, slope, clusters, weights)
-        for place in clusters:
-            numbers, images, weighted = equations.list_cluster(place)
-            normal[np.ix_(numbers, numbers)] += weighted @ images.T
-            slope[numbers] += weighted @ rest[_find_cluster(place)].ravel()
-        return equations
+        clusters = []
+        for (row, column), found in parts.items():
+            area = slice(row, row + CLUSTER_ROWS), slice(column, column + CLUSTER_COLUMNS)
+            numbers, images = (np.concatenate(one) for one in zip(*found, strict=True))
+            weighted = images * weights[area].ravel()
+            information = weighted @ images.T
+            normal[np.ix_(numbers, numbers)] += information
+            slope[numbers] += weighted @ rest[area].ravel()
+            clusters.append(Cluster(numbers, information, weighted @ error[area].ravel()))
+        return cls(names, normal, slope, clusters)
 
-    def list_cluster(self, place: tuple[int, int]) -> tuple[NDArray[np.intp], Image, Image]:
-        """Return the numbers of a cluster's unknowns, and their derivatives, (n, pixels), plain and
-        weighted.
-        """
-        own, parts = zip(*self.clusters[place], strict=True)
-        images = np.concatenate([part.reshape(len(part), -1) for part in parts])
-        return np.concatenate(own), images, images * self.weights[_find_cluster(place)].ravel()
-
-    def estimate_covariances(
-        self, inverse: FloatArray, known: FloatArray, error: Image
-    ) -> FloatArray:
+    def estimate_covariances(self, inverse: FloatArray, known: FloatArray) -> FloatArray:
         """Return the covariance ``H^-1 S H^-1``, (unknowns, unknowns), right within the blocks of each
-        surface's coefficients. S is the sum of squares of the clusters' scores, with the misfit `error`
-        as it was before the step, and of what was known before; `inverse`: of the normal matrix.
+        surface's coefficients. S is the sum of squares of the clusters' scores and of what was known
+        before; `inverse`: of the normal matrix.
 
         A step explains a part of each cluster's misfit, the more the fewer clusters there are, and what
         is left is too little. With the leverage h of a cluster, ``1 - h`` of its variance is left
         (R. Bell and D. McCaffrey, Surv. Methodol. 28, 169, 2002), here in each direction of what the
         cluster says of a surface.
         """
-        surfaces = np.array([n if name == "coefficients" else -1 for name, n, _ in self.names])
         scores = np.zeros((len(self.clusters), self.slope.size))
-        for score, place in zip(scores, self.clusters, strict=True):
-            own, images, weighted = self.list_cluster(place)
-            score[own] = weighted @ error[_find_cluster(place)].ravel()
-        influence = scores @ inverse
-        covariance = inverse @ known @ inverse
-        parts = [np.flatnonzero(surfaces == one) for one in np.unique(surfaces[surfaces >= 0])]
-        roots = {part[0]: _take_root(inverse[np.ix_(part, part)]) for part in parts}
-        for score, place in zip(influence, self.clusters, strict=True):
-            for own, images in self.clusters[place]:
-                if own[0] in roots:
-                    factor, inverse_factor = roots[own[0]]
-                    along = factor.T @ images.reshape(own.size, -1)
-                    scaled = along * self.weights[_find_cluster(place)].ravel()
-                    leverage, axes = np.linalg.eigh(scaled @ along.T)
-                    left = np.sqrt(1 - np.clip(leverage, 0, MAX_LEVERAGE))
-                    score[own] = factor @ (axes @ (axes.T @ (inverse_factor @ score[own]) / left))
-        for part in parts:
+        for score, cluster in zip(scores, self.clusters, strict=True):
+            score[cluster.numbers] = cluster.score
+        influence, covariance = scores @ inverse, inverse @ known @ inverse
+        surfaces = np.array([n if name == "coefficients" else -1 for name, n, _ in self.names])
+        for surface in np.unique(surfaces[surfaces >= 0]):
+            part = np.flatnonzero(surfaces == surface)
+            factor, inverse_factor = _take_root(inverse[np.ix_(part, part)])
+            own = [surfaces[cluster.numbers] == surface for cluster in self.clusters]
+            says = np.flatnonzero([one.any() for one in own])
+            said = np.array(
+                [self.clusters[one].information[np.ix_(own[one], own[one])] for one in says]
+            )
+            leverage, axes = np.linalg.eigh(factor.T @ said @ factor)
+            left = np.sqrt(1 - np.clip(leverage, 0, MAX_LEVERAGE))
+            along = influence[np.ix_(says, part)] @ inverse_factor.T
+            along = (along[:, np.newaxis] @ axes)[:, 0] / left
+            influence[np.ix_(says, part)] = (axes @ along[..., np.newaxis])[..., 0] @ factor.T
             covariance[np.ix_(part, part)] += influence[:, part].T @ influence[:, part]
         return covariance
-
-
-def _find_cluster(place: tuple[int, int]) -> tuple[slice, slice]:
-    return (
-        slice(place[0], place[0] + CLUSTER_ROWS),
-        slice(place[1], place[1] + CLUSTER_COLUMNS),
-    )
 
 
 def _take_root(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -372,7 +368,7 @@ def refine_state(
     # 3. The covariance is ``H^-1 S H^-1`` with the information H of the data and the sum S of squares
     # of the score over clusters of measurements (H. White, Econometrica 50, 1, 1982): it holds the
     # noise that the misfit has, also where misfits of neighbouring measurements depend on each other.
-    equations = NormalEquations.multiply(groups, model.weights, rest)
+    equations = NormalEquations.multiply(groups, model.weights, rest, error)
     names = equations.names
     second, first = _differentiate_priors(model, names)
     unit = np.sqrt(np.diag(equations.normal)) + TINY
@@ -384,7 +380,7 @@ def refine_state(
     longer = [lengthen_step(newton, history, equations.normal + second)] if history else []
     covariance = inverse
     if robust:
-        covariance = equations.estimate_covariances(inverse, second, error)
+        covariance = equations.estimate_covariances(inverse, second)
         # What a sweep's prior still takes of all ranges, as if most of it were not there
         weaker = (equations.normal + SWEEP_DOUBT * second) / np.outer(unit, unit)
         swept = np.array([name in SWEEP_SIGMAS for name, _, _ in names])
