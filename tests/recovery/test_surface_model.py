@@ -69,17 +69,37 @@ def test_what_no_quadratic_follows_gets_splines():
     assert np.median(np.abs(patch.compute_ranges(patch.pixels) - waves.ravel())) < 0.15 * BIN_M
 
 
+def meet(middle, radius, axes):
+    """Ranges of a ball or a rod, (64, 64), m, NaN beside it; how far inside its limb a ray is; range over
+    depth.
+    """
+    y, x = np.indices((64, 64))
+    rays = np.stack([(x - 32) / 300, (y - 32) / 300, np.ones(x.shape)], axis=-1)
+    middle, across = np.array(middle), np.array(axes)
+    a, b = np.sum(across * rays**2, axis=-1), rays @ (across * middle)
+    inside = b**2 - a * (np.sum(across * middle**2) - radius**2)
+    ray_length = np.linalg.norm(rays, axis=-1)
+    with np.errstate(invalid="ignore"):
+        return ray_length * (b - np.sqrt(inside)) / a, inside, ray_length
+
+
+def test_a_ball_and_the_cable_beside_it_are_parted():
+    """Neighbours' ranges nowhere differ by more than a bin or two: they are one patch of returns, which
+    one surface followed to 1.2 bins.
+    """
+    things = (meet((0.02, 0.0, 1.5), 0.09, (1, 1, 1)), meet((-0.07, 0.0, 1.48), 0.03, (1, 0, 1)))
+    seen = [np.where(inside > 0.12 * inside.max(), ranges, np.nan) for ranges, inside, _ in things]
+    truth = np.fmin(*seen)
+    noise = 3e-4 * np.random.default_rng(0).standard_normal(truth.shape)
+    for patch in find_patches_in(truth + noise, things[0][2]):
+        error = patch.compute_ranges(patch.pixels) - truth.ravel()[patch.pixels]
+        assert np.median(np.abs(error)) < 0.15 * BIN_M
+
+
 @pytest.mark.parametrize("axes", [(1, 1, 1), (1, 0, 1)])
 def test_a_ball_and_a_rod_are_followed_up_to_their_limbs(axes):
     """Frames' returns at a limb are far too near, all of them, and no polynomial is as steep."""
-    y, x = np.indices((64, 64))
-    rays = np.stack([(x - 32) / 300, (y - 32) / 300, np.ones(x.shape)], axis=-1)
-    ray_length = np.linalg.norm(rays, axis=-1)
-    middle, radius, across = np.array([0.03, -0.02, 1.5]), 0.12, np.array(axes)
-    a, b = np.sum(across * rays**2, axis=-1), rays @ (across * middle)
-    inside = b**2 - a * (np.sum(across * middle**2) - radius**2)
-    with np.errstate(invalid="ignore"):
-        truth = ray_length * (b - np.sqrt(inside)) / a
+    truth, inside, ray_length = meet((0.03, -0.02, 1.5), 0.12, axes)
     limb = inside / inside.max() < 0.15
     random = np.random.default_rng(0)
     distance = truth + 3e-4 * random.standard_normal(truth.shape)
