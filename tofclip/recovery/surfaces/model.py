@@ -57,6 +57,7 @@ MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
 SWEEP_LEFT_FRACTION = (
     0.15  # of the corrections to a sweep, which are lines: what is left of its shape
 )
+PACE_PLACES = 16  # one of so many says how long rows take, on average
 PARALLEL_POINTS = 20_000  # threads take as long to begin as so many need
 MIN_BEHIND_PX = 100  # of a surface, seen through another; fewer are a rim, of which each has a part
 FRONT_FRACTION = 0.5  # of a surface's usual brightness: it ends where its rim is darker
@@ -317,8 +318,9 @@ class SurfaceModel:
         # rows before and behind the streak image whose light reaches it later or earlier
         self.before = int(max(self.pulse.lags.max(), 0))
         self._rows = self.before + self.image.shape[0] + int(max(-self.pulse.lags.min(), 0))
+        where = self._find_directions()
         spread = self.share_out(
-            lambda views: [self._spread_view(view) for view in views], self.camera.views
+            lambda views: [self._spread_view(view, *where) for view in views], self.camera.views
         )
         self.footprints = list(itertools.chain.from_iterable(spread))
         self.kernels = [self.make_kernel(view) for view in range(self.camera.views)]
@@ -349,7 +351,20 @@ class SurfaceModel:
         ]
         return np.where(np.array(found) < 0, own, found)
 
-    def _spread_view(self, view: int) -> Footprint:
+    def _find_directions(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Where parts of points are in the picture, (places,) from the optical axis, px, to the right and
+        down, and in which directions, (places, 3).
+        """
+        axis_row, axis_column = self.camera.optical_axis_px
+        x, y = (
+            one[self.places.point] + off
+            for one, off in zip((self._x, self._y), self.places.offset, strict=True)
+        )
+        return x, y, compute_ray_directions(self.camera, y + axis_row, x + axis_column)
+
+    def _spread_view(
+        self, view: int, x: FloatArray, y: FloatArray, directions: FloatArray
+    ) -> Footprint:
         """Return which rows and columns of a view the light of points reaches. Nothing of what
         misses the streak image is kept: a surface may run off without end, and one that comes close
         is spread over all of the slit's plane.
@@ -357,7 +372,7 @@ class SurfaceModel:
         from tofclip.recovery.surfaces import kernels
 
         rows, margin, samples = self._rows, self._margin, kernels.SPLINE_SAMPLES
-        row, column, between, pace = self._locate(view)
+        row, column, between, pace = self._locate(view, x, y, directions)
         first_parts = self.places.starts[:-1]
         between = BetweenCentres(between.before[first_parts], between.fraction[first_parts])
         height = self.measure_height(row[first_parts])
@@ -389,19 +404,15 @@ class SurfaceModel:
         reached_rows = np.flatnonzero(reached) - margin - top
         return Footprint(*light, lines - top, reached_rows, between, height, pace)
 
-    def _locate(self, view: int) -> tuple[FloatArray, FloatArray, BetweenCentres, float]:
+    def _locate(
+        self, view: int, x: FloatArray, y: FloatArray, directions: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BetweenCentres, float]:
         """Where parts of points fall in a view, (places,): row and column of the raw streak image,
         between which centres, and how many raw rows the time of one takes.
         """
         camera, position = self.camera, self.camera.view_positions[view]
-        axis_row, axis_column = camera.optical_axis_px
-        parts = self.places
-        x, y = (
-            one[parts.point] + off
-            for one, off in zip((self._x, self._y), parts.offset, strict=True)
-        )
-        points = compute_ray_directions(camera, y + axis_row, x + axis_column)
-        points *= parts.distance[:, np.newaxis]
+        distance = self.places.distance
+        points = directions * distance[:, np.newaxis]
         viewpoint = np.array([camera.lenslet_pitch * position, 0.0, 0.0])
         back = np.linalg.norm(points - viewpoint, axis=1)
         column = (
@@ -412,12 +423,13 @@ class SurfaceModel:
             + camera.shear_at(points[:, 2]) * position
         )
         between = BetweenCentres.find(camera.centres_px, column)
-        time = (parts.distance + back) / SPEED_OF_LIGHT + camera.time_zero
+        time = (distance + back) / SPEED_OF_LIGHT + camera.time_zero
         row, pace = find_rows(self.times, time), 1.0
         if camera.sweep is not None:
-            later, _ = camera.sweep.raw_position(row + 0.5, column)
+            few = slice(None, None, PACE_PLACES)
+            later, _ = camera.sweep.raw_position(row[few] + 0.5, column[few])
             row, raw_column = camera.sweep.raw_position(row, column)
-            pace = 2 * float(np.mean(later - row)) if row.size else 1.0
+            pace = 2 * float(np.mean(later - row[few])) if row.size else 1.0
             column = np.array(raw_column, np.float64)
         delay, stretch = (
             between.interpolate(one) for one in (self.state.delays, self.state.stretches)

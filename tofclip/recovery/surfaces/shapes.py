@@ -211,8 +211,12 @@ def fit_quadric(
         starts.append(np.concatenate([[limb, 0, 0], q]))
     found = min(starts, key=lambda one: float(np.median(np.abs(measure(one)))))
     # frames' returns at a limb are far too near, all of them: what the others do not share hardly counts
+    before = np.inf
     for _ in range(FIT_ROUNDS):
         scale = float(np.median(np.abs(measure(found)))) + TINY
+        if abs(scale - before) < FIT_TOLERANCE * scale:
+            break
+        before = scale
         settings = {"loss": "arctan", "f_scale": scale, "x_scale": "jac"}
         settings |= {"ftol": FIT_TOLERANCE, "max_nfev": FIT_STEPS}
         found = scipy.optimize.least_squares(measure, found, differentiate, **settings).x
