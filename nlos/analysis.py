@@ -254,9 +254,8 @@ def require_usable_cycles(capture: Capture, cycles: float) -> None:
 
 def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str] | None:
     """Choose the carrier for a gated capture, m, and say why: the shortest that wall points and
-    time bins carry, with more signal than noise. Only waves that stand out of noise make false
-    images: these the wall has to sample, at the steepest angle. None where the spectrum does not
-    tell.
+    time bins carry. Only waves that stand out of noise make false images: these the wall has to
+    sample, at the steepest angle. None where the spectrum does not tell, as in the photons' noise.
     """
     sampled = find_shortest_wavelength(capture, cycles)
     reason = "the shortest that wall points and time bins carry"
@@ -272,8 +271,8 @@ def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str] | No
     while wavelength < longest:
         pulse = VirtualPulse(wavelength, cycles)
         if spectrum.coherent_signal(pulse) < MIN_COHERENT_SIGNAL:
-            reason = "shorter waves are weaker than the photons' noise"
-        elif spectrum.fraction_shorter(pulse, aliased or np.inf) > MAX_ALIASED_FRACTION and aliased:
+            return None  # what all wall points see of a place together may still stand out
+        if spectrum.fraction_shorter(pulse, aliased or np.inf) > MAX_ALIASED_FRACTION and aliased:
             reason = "shorter waves are finer than the wall points sample"
         elif spectrum.band_over_early(pulse) < MIN_BAND_OVER_EARLY:
             reason = "shorter waves are as strong before any light can have come"

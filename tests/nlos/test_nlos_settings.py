@@ -108,8 +108,7 @@ def test_noise_makes_the_wave_longer_and_nothing_makes_it_jump():
     waves = [one.wavelength or 0.0 for one in found]
     assert waves[0] < waves[-1]
     assert max(abs(np.diff(np.log(waves)))) < np.log(1.1)
-    assert "noise" in found[1].reasons["wavelength"]
-    assert "picture" in found[2].reasons["wavelength"]
+    assert "picture" in found[-1].reasons["wavelength"]
 
 
 def test_transforms_see_the_lattice_whatever_the_wavelength():
