@@ -279,10 +279,8 @@ def _bend_where_needed(patch: Patch, bin_m: float) -> Patch:
         return patch
     bent = _give_splines(patch)
     if patch.pixels.size >= MIN_ROUND_PX:
-        some = slice(None, None, 1 + patch.pixels.size // FITTED_RETURNS)
-        pixels, distance = patch.pixels[some], patch.distance[some]
-        inverse = patch.ray_length.ravel()[pixels] / distance
-        basis, coefficients = fit_quadric(pixels, inverse, patch.basis.image_shape)
+        inverse = patch.ray_length.ravel()[patch.pixels] / patch.distance
+        basis, coefficients = fit_quadric(patch.pixels, inverse, patch.basis.image_shape)
         quadric = replace(patch, basis=basis, coefficients=coefficients)
         bent = min(quadric, bent, key=Patch.compute_error)
     return bent if bent.compute_error() < BENT_FRACTION * plain else patch
