@@ -158,21 +158,3 @@ def test_a_page_for_each_verb(tmp_path):
     listed = (tmp_path / "index.md").read_text()
     assert all(f"\n{path.stem}\n" in listed for path in pages[:-1])
     assert "tofclip --install-completion" in listed
-
-
-def test_the_help_has_the_headings_of_the_page(shell):
-    """Settings apart from options, defaults in words without brackets of their own, prose as wide as
-    the terminal even where a line begins with an option, and arguments by their names.
-    """
-    shown = shell("nlos reconstruct --help").out
-    words = ("\nOptions:", "  --json ", "\nSettings (", "--cycles N")
-    places = [shown.index(word) for word in words]
-    assert places == sorted(places)
-    assert "(None)" not in shown
-    assert "[default: (" not in shown
-    assert "Usage: tofclip nlos reconstruct [OPTIONS] CAPTURE\n" in shown
-    assert "refine photons looks for the albedo" in " ".join(shown.split())
-    assert max(map(len, shown.splitlines())) <= 80
-    usage = shell("calibrate range --help").out.splitlines()[0]
-    assert "SHOT..." in usage
-    assert "{" not in usage

@@ -110,15 +110,6 @@ def assert_gates_show_the_scene(bound_m):
 GATED = "sim+spad512://?seed=1&mode=gated&gate_offset_ps=7000&gate_width_ns=3"
 
 
-def test_a_gated_arrays_address_becomes_ranges(shell):
-    """One command from an instrument to ranges on its own time axis."""
-    line = f"lidar photons {GATED}&binning=16&gate_steps=24&gate_step_ps=640 --out range.npz"
-    assert shell(line).status == 0
-    # Steps are 96 mm; where none of them falls on an edge, the edge may be anywhere between two.
-    assert_gates_show_the_scene(0.048)
-    assert shell(f"{line} --bin-width-ps 9").status == 2
-
-
 def test_a_recording_of_a_gated_array_becomes_ranges(shell):
     """SPAD512: one whole scan of a recording, by its address."""
     line = f"record {GATED}&gate_steps=8&gate_step_ps=1920 --out run.h5 --seconds 2"

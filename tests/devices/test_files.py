@@ -7,8 +7,6 @@ import struct
 import sys
 import tracemalloc
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,7 +30,6 @@ ptufile = pytest.importorskip("ptufile")
 sdtfile = pytest.importorskip("sdtfile")
 
 DECAYS = make_decays()
-Write = Callable[[str], Path]
 
 
 @pytest.fixture

@@ -145,15 +145,6 @@ def test_tags_count_from_the_last_pulse():
     assert_allclose(histogram.counts, expected, atol=1e-9)
 
 
-def test_tags_after_a_gap_wait_for_the_next_pulse():
-    histogram = TagHistogram(BinAxis(1e-9, 10), 3, (0,), 1e-9)
-    histogram.add(tags([(10, 0b1000, 0)]))
-    histogram.add(tags([(12, 1, 0)]))
-    histogram.add(tags([(14, 1, 0)]), after_gap=True)
-    histogram.add(tags([(15, 0b1000, 0), (17, 1, 0)]))
-    assert histogram.counts.sum() == pytest.approx(2)
-
-
 def test_tags_on_threads_know_the_pulse_before_their_piece(monkeypatch):
     """Pulses are so rare that a piece may hold none."""
     random = np.random.default_rng(4)

@@ -6,11 +6,9 @@ import socket
 import string
 import threading
 import time
-from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
@@ -59,7 +57,6 @@ LIGHT = EmulatedLight(
 )
 ARRAY_LIGHT = np.random.default_rng(2).uniform(0, 2e5, (ROWS, ROWS))
 DELAYS_S = np.full((ROWS, ROWS), 8e-9)
-Make = Callable[..., Any]
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import weakref
 from dataclasses import replace
 from functools import partial
 
@@ -23,7 +22,6 @@ from tofclip.sequences import (
     list_files,
     list_shots,
 )
-from tofclip.sequences.cache import CachedInverse, get_cached_camera
 from tofclip.sequences.jobs import run_jobs, select_unfinished
 from tofclip.storage import Record
 
@@ -194,23 +192,3 @@ def test_results_keep_the_folders_of_their_inputs(recorded, linear, tmp_path):
     shots = list_shots(str(tmp_path / "days" / "*" / "*.h5"), bin_width=50e-12)
     assert run_jobs(linear.jobs(shots, tmp_path / "out")).done == 2
     assert (tmp_path / "out" / "b" / "shot0.h5").exists()
-
-
-def test_operators_and_inverses_are_kept_by_content(camera):
-    one, other = (
-        get_cached_camera(camera),
-        get_cached_camera(Camera.from_record(camera.to_record())),
-    )
-    assert one.operator(0.5) is other.operator(0.5)
-    assert one.operator(0.5) is not one.operator(0.25)
-    brighter = camera.replace(gains=2 * camera.gains)
-    assert get_cached_camera(brighter).operator(0.5) is not one.operator(0.5)
-
-    def prepare(shear):
-        return CachedInverse().prepare(one.operator(shear), ~camera.dead_columns)
-
-    inverses = [prepare(shear) for shear in np.linspace(0, 1, 18)]
-    assert prepare(1.0) is inverses[-1]
-    assert prepare(0.0) is not inverses[0]  # 16 are kept, the first two had to go
-    made = [weakref.ref(one.operator(shear)) for shear in np.linspace(1.1, 2, 40)]
-    assert sum(operator() is not None for operator in made) == 32

@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 import scipy.sparse
 
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import ShapeError
 from tofclip.operators import LineProjection, RadonProjection, SparseMatrix, estimate_squared_norm
 from tofclip.solvers import (
     Fista,
@@ -342,32 +342,6 @@ def test_it_beats_every_nearby_picture():
     assert lowest < objective(np.full_like(picture, picture.mean()))
     single, _ = smooth(picture, weight, calls=4000, dtype=np.float32)
     np.testing.assert_allclose(single, best, atol=2e-6)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        NonnegativeTotalVariation,
-        partial(NonnegativeLightFieldVariation, grid=(2, 2), angular=0.5),
-        NonnegativeWavelets,
-    ],
-    ids=["variation", "light field", "wavelets"],
-)
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_without_a_weight_only_negative_values_are_cut(make, dtype):
-    shape = (4, 5, 5, 1) if isinstance(make, partial) else (37, 45, 3)
-    picture = np.random.default_rng(0).standard_normal(shape).astype(dtype)
-    result, penalty = denoise(make(0.0), picture, 1)
-    assert (result.dtype, penalty.dtype) == (dtype, np.float64)
-    bound = 1e-6 if dtype == np.float32 else 1e-9
-    np.testing.assert_allclose(result, np.maximum(picture, 0), atol=bound)
-    np.testing.assert_array_equal(penalty, 0)
-    result, penalty = denoise(make(0.1), np.full(shape, -1.0, dtype), 5)
-    assert result.max() == 0
-    np.testing.assert_allclose(penalty, 0, atol=1e-6)
-    for weight in (-1.0, np.nan, np.inf):
-        with pytest.raises(InputError, match="weight"):
-            make(weight)
 
 
 def test_views_on_their_own_are_ordinary_pictures():

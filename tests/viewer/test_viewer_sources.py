@@ -126,16 +126,6 @@ def test_time_walks_through_a_transient(transient):
     assert transient.find_gate(2) == range(8)
 
 
-def test_playing_begins_anew_and_ends_at_the_last_frame(transient):
-    session = Session(transient)
-    session.clock.play()
-    assert session.frame_at(10.0).frame == 0
-    assert 0 < session.frame_at(11.0).frame < FRAMES - 1
-    assert session.frame_at(1000.0).frame == FRAMES - 1
-    assert not session.clock.playing
-    assert session.label == "REPLAY"
-
-
 def test_a_pick_brings_its_pixels_waveform(transient):
     session = Session(transient)
     shown = session.frame_at(0.0).cloud
