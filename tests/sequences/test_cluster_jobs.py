@@ -61,6 +61,7 @@ def test_workers_do_what_is_done_here_however_many_jobs_there_are(scheduler, tmp
     assert run_jobs([], scheduler).done == 0
 
 
+@pytest.mark.nightly  # five workers start again: 7 s of processor time
 def test_a_killed_worker_costs_at_most_the_job_that_kills_every_one(scheduler, tmp_path):
     jobs = squares(tmp_path, 30)
     for name, every_time in (("once", False), ("always", True)):

@@ -88,6 +88,7 @@ def test_a_sweep_has_a_folder_for_each_combination(run, recorded, tmp_path):
     assert run(f"{line} --sweep iterations")[0] == 2
 
 
+@pytest.mark.nightly
 def test_workers_look_for_the_device_themselves(run, scheduler, few, tmp_path):
     pytest.importorskip("torch", reason="PyTorch is optional")
     (few / "shot1.h5").unlink()
@@ -195,7 +196,8 @@ def test_captures_on_a_cluster_are_imaged_as_here(run, scheduler, tmp_path):
     assert run(line)[0] == 2
 
 
-@pytest.mark.parametrize("after_s", [0.0, 1.0])  # while workers start, and while they work
+# While workers start, and while they work.
+@pytest.mark.parametrize("after_s", [pytest.param(0.0, marks=pytest.mark.nightly), 1.0])
 def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path, after_s):
     shots, out = tmp_path / "shots", tmp_path / "out"
     shots.mkdir()
