@@ -221,7 +221,7 @@ class TestStudies:
         assert ours[right] >= max(one[right] for one in others)
 
     @pytest.mark.nightly
-    @pytest.mark.parametrize(("name", "worst"), zip(SCENES, (0.55, 0.75, 0.18), strict=True))
+    @pytest.mark.parametrize(("name", "worst"), list(zip(SCENES, (0.55, 0.75, 0.18), strict=True)))
     def test_single_returns_hardly_make_pictures_noisier_in_little_light(self, name, worst):
         """Of seeds 1 and 2, 21 to 25: 0.36 to 0.38, 0.45 to 0.62 and 0.11 to 0.15; twice that where all of
         their light was drawn.
