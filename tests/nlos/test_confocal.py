@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scenes import around, find_refusal, relative_error, scaled_error, see
 
 from nlos import Capture, FKMigration, Grid, LightCone
 from nlos.capture import TimeAxis
+from nlos.confocal import apply_wiener_filter
 from tofclip.errors import InputError
 
 # Odd and unequal sizes; path per bin about the wall's step.
@@ -160,6 +162,16 @@ def test_the_light_cone_transform_reads_depths_to_a_fraction_of_a_bin():
         bright = np.where(line > line.max() / 2, line, 0)
         errors.append(np.sum(bright * depths) / np.sum(bright) - depth)
     assert abs(np.mean(errors)) < 0.2 * axis.spacing / 2
+
+
+def test_the_filter_is_wiener_s():
+    random = np.random.default_rng(0)
+    quarter = random.standard_normal((3, 3, 4)) + 1j * random.standard_normal((3, 3, 4))
+    spectrum = np.ones((4, 4, 4), np.complex64)
+    apply_wiener_filter(spectrum, quarter.astype(np.complex64), 0.5)
+    expected = quarter.conj() / (np.abs(quarter) ** 2 + 2)
+    assert_allclose(spectrum[:3, :3], expected, rtol=1e-5)
+    assert_allclose(spectrum[3, 3], expected[1, 1], rtol=1e-5)
 
 
 def test_migration_keeps_the_sign_of_signals_below_the_background():

@@ -11,6 +11,7 @@ from scenes import FIVE_POINTS, distance_to_nearest, energy_fraction, planar_wal
 from nlos import Capture, Grid, Hybrid
 from nlos.capture import TimeAxis
 from nlos.refinement.photons import (
+    HELD_OUT_FRACTION,
     LINEAR_SHOWN,
     CountedPhotons,
     PhotonFit,
@@ -18,6 +19,7 @@ from nlos.refinement.photons import (
     TimeOfFlight,
     build_response,
     compute_beam,
+    judge,
 )
 from nlos.simulate import HiddenScene, PointScene, Surface, add_poisson_noise, build_relay_wall
 from tofclip.errors import InputError
@@ -170,6 +172,9 @@ def test_what_is_not_counted_is_refused(change, reason):
 SHORT, WALL = TimeAxis(256, 32e-12), planar_wall(8, 8)
 
 
+GRID = Grid(np.linspace(-0.4, 0.4, 9), np.linspace(-0.4, 0.4, 9), np.linspace(0.5, 1.0, 6))
+
+
 def make_fit(wall, grid, albedo, sigma=0.0):
     """A fit that explains the photons of this albedo, without noise, and of a background."""
     capture = Capture(np.ones((SHORT.bins, *wall.shape[:2])), wall, wall, SHORT.bin_width)
@@ -186,6 +191,20 @@ def point_albedo(grid, *places):
     for place in places:
         albedo[grid.find_nearest(place)] = 1
     return albedo.ravel()
+
+
+def test_photons_set_aside_prefer_the_fit_that_is_as_bright_as_the_scene():
+    fit = make_fit(WALL, GRID, point_albedo(GRID, (0.1, 0.0, 0.7), (-0.2, 0.2, 0.9)))
+    fit.improve(1)
+    # What the kept photons are of is what this fit expects; of all photons a tenth was set aside.
+    fit.photons = replace(fit.photons, counts=fit.expect())
+    held = fit.photons.counts * HELD_OUT_FRACTION / (1 - HELD_OUT_FRACTION)
+    light = fit.model.compute_light(np.ones(GRID.size), fit.voxels, np.arange(64))
+    albedo, background, gains = fit.albedo, fit.background, {}
+    for scale in (0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2):
+        fit.albedo, fit.background = albedo * np.float32(scale), background * np.float32(scale)
+        gains[scale] = judge(fit, light, held)[0]
+    assert max(gains, key=lambda scale: gains[scale]) == 1.0
 
 
 @pytest.mark.parametrize("sigma", [0.0, 2.0])
