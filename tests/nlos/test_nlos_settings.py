@@ -7,7 +7,7 @@ import pytest
 from numpy.linalg import norm
 from scenes import planar_wall, reorder, see
 
-from nlos import Grid, Settings, Volume, reconstruct, settings_for
+from nlos import Capture, Grid, Settings, Volume, reconstruct, settings_for
 from nlos.analysis import choose_wavelength, find_first_bounce
 from nlos.band import VirtualPulse
 from nlos.capture import TimeAxis
@@ -45,6 +45,32 @@ def test_the_walls_own_light_is_recognised_and_gated(confocal, peak):
     prepared = settings.prepare(with_glare(clean(confocal), peak))
     volume = settings.make_method().reconstruct(prepared, settings.grid(0.05))
     assert volume.find_brightest() == pytest.approx(HIDDEN[0], abs=0.06)
+
+
+def lit_late(hidden, confocal, peak=0.0, fades=1.0):
+    """Every wall point sees light of brightness 1 that much path (m) after the wall's own."""
+    axis, laser = TimeAxis(1700, 3e-12), WALL if confocal else np.zeros(3)
+    late = axis.paths[:, None, None] - norm(WALL - laser, axis=-1)
+    glare = np.where(late >= 0, peak * np.exp(-np.maximum(late, 0) / fades), 0)
+    signal = glare + np.exp(-(((late - hidden) / 0.05) ** 2) / 2)
+    return Capture(signal, WALL, laser, axis.bin_width)
+
+
+PROFILE_STEP, ROUNDING = 0.72 / 50, 1e-3
+"""m of path by which the mean signal is looked at, of the wall's width; and a bin, to which steps
+begin.
+"""
+
+
+@pytest.mark.parametrize("confocal", [True, False])
+@pytest.mark.parametrize("peak", [10.0, 1000.0])
+def test_the_gate_ends_where_the_walls_light_is_a_tenth_of_what_follows(confocal, peak):
+    for fades in np.linspace(0.04, 0.06, 5):
+        bounce = find_first_bounce(lit_late(1.2, confocal, peak, fades))
+        assert bounce is not None
+        faded = fades * np.log(10 * peak)
+        # In the middle of the first step of the profile at which it has.
+        assert faded - ROUNDING < bounce.end < faded + PROFILE_STEP + ROUNDING
 
 
 @pytest.mark.parametrize("depth", [0.5, 0.8, 1.3])

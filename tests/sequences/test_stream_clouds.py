@@ -11,9 +11,10 @@ import pytest
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
 from tofclip.lidar import depth, point_cloud
+from tofclip.lidar.pulse_tables import TraceBins
 from tofclip.recovery import DepthLockedFocus, recover
 from tofclip.sequences import make_pipeline
-from tofclip.sequences.ranger import RangingPipeline, SurfacePipeline
+from tofclip.sequences.ranger import RangingPipeline, SurfacePipeline, WarmStartedRecovery
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
@@ -236,3 +237,34 @@ def test_a_scene_that_changes_slowly_is_searched_anew(streaks, camera, see):
         counts = streaks[0].counts + np.float32(brightness) * coming.counts
         follow(pipeline, replace(streaks[0], counts=counts))
         assert pipeline.searches == searches
+
+
+def test_a_row_begins_at_its_own_picture_whatever_rows_were_lit_before():
+    """Nothing moves and there is no noise: a row that goes on from its own picture stays there,
+    whichever rows have come and gone around it.
+    """
+    camera = Camera([16.0, 40.0, 64.0], [-0.6, 0.1, 0.7], (12, 12), 80)
+    random = np.random.default_rng(0)
+    scene = np.where(random.random((12, 12, 9)) < 0.1, 1.0, 0.0).astype(np.float32)
+    operator = camera.operator()
+    seen = operator(scene)
+    method = Sparse(iterations=600, gap=0.0)
+    recovery = WarmStartedRecovery(method, [(slice(0, 999), operator)], ~camera.dead_columns)
+
+    def recover(*rows):
+        bins = TraceBins(np.array(rows), np.ones(len(rows), bool), np.ones(len(rows), np.float32))
+        traces = recovery.recover(seen[:, rows], bins)
+        pictures = np.empty((traces.pixels.size, len(rows)), np.float32)
+        traces.fill(slice(None), pictures)
+        return dict(zip(rows, pictures.T, strict=True))
+
+    last = recover(0, 1, 2, 4, 5, 6)
+    # another number of rows, then as many others
+    for rows, new in (((1, 3, 5, 6, 8), 3), ((3, 5, 6, 7, 8), 7)):
+        found = recover(*rows)
+        last = {row: picture for row, picture in last.items() if row in rows}
+        for row, picture in last.items():
+            assert np.linalg.norm(found[row] - picture) < 0.01 * np.linalg.norm(picture)
+        # twelve iterations from darkness, or from another row's picture, are far from it
+        truth = scene[..., new].ravel()
+        assert np.linalg.norm(found[new] - truth) > 0.3 * np.linalg.norm(truth)
