@@ -15,7 +15,8 @@ from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import Image
 
 PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
-NORM_ITERATIONS, FURTHER_NORM_ITERATIONS = 10, 2
+# At least and at most, until norms change by as little: where many surfaces share measurements it takes long
+NORM_ITERATIONS, FURTHER_NORM_ITERATIONS, MOST_NORM_ITERATIONS, SETTLED_NORM = 10, 2, 40, 0.02
 NORM_MARGIN = 1.1
 EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
@@ -169,11 +170,14 @@ class AmplitudeSolver:
         model, count = self.model, len(self.model.masks)
         vector, norms = self._direction, np.ones(count)
         # the vector of the last time is nearly the one of moved surfaces
-        for _ in range(NORM_ITERATIONS if self._fresh else FURTHER_NORM_ITERATIONS):
-            vector = model.pull(vector)
+        least = NORM_ITERATIONS if self._fresh else FURTHER_NORM_ITERATIONS
+        for number in range(MOST_NORM_ITERATIONS):
+            vector, before = model.pull(vector), norms
             norms = np.sqrt(np.bincount(model.surface, vector.astype(np.float64) ** 2, count))
             norms = np.maximum(norms, 1e-3 * norms.max())
             vector /= norms[model.surface].astype(np.float32)
+            if number + 1 >= least and np.all(norms < (1 + SETTLED_NORM) * before):
+                break
         self._direction, self._fresh = vector, False
         return norms
 
