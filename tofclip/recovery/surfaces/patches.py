@@ -292,6 +292,13 @@ def _part_at_creases(patch: Patch, bin_m: float) -> list[Patch]:
     """
     whole = _bend_where_needed(patch, bin_m)
     error = whole.compute_error()
+    if error < BEND_BINS * bin_m:
+        return [whole]
+    if len(pieces := _list_pieces(patch)) > 1:
+        bent = [_bend_where_needed(piece, bin_m) for piece in pieces]
+        off = [np.abs(one.compute_ranges(one.pixels) - one.distance) for one in bent]
+        if np.median(np.concatenate(off)) < BENT_FRACTION * error:
+            return [part for piece in pieces for part in _part_at_creases(piece, bin_m)]
     if error < CREASE_BINS * bin_m or whole.compute_misfit(whole) < CREASE_SIGMAS:
         return [whole]
     y, x = np.divmod(patch.pixels, patch.ray_length.shape[1])
@@ -308,6 +315,15 @@ def _part_at_creases(patch: Patch, bin_m: float) -> list[Patch]:
     if best is None:
         return [whole]
     return [part for half in best for part in _part_at_creases(half, bin_m)]
+
+
+def _list_pieces(patch: Patch) -> list[Patch]:
+    """The pieces of a patch that nothing joins in the picture, as of a head and an arm of one range."""
+    seen = np.zeros(patch.ray_length.shape, bool)
+    seen.ravel()[patch.pixels] = True
+    piece = scipy.ndimage.label(seen, np.ones((3, 3)))[0].ravel()[patch.pixels]
+    large = np.flatnonzero(np.bincount(piece) >= MIN_PATCH_PX)
+    return [patch.take(piece == one) for one in large]
 
 
 def _part_in_two(patch: Patch, second: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
