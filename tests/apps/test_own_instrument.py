@@ -42,7 +42,8 @@ class HistogramServer:
     """Sends pictures, `rate` a second, to who connects; number 3 is never sent."""
 
     def __init__(self, ranges, rate=25.0):
-        self.drawn = [draw_histograms(ranges, seed).tobytes() for seed in range(16)]
+        # A busy machine takes one of many: that none comes twice, their noise is another each time.
+        self.drawn = [draw_histograms(ranges, seed).tobytes() for seed in range(64)]
         self.rate, self._closing = rate, threading.Event()
         self._server = LoopbackServer(self._serve)
         self.address = f"histograms://{HOST}:{self._server.port}"
