@@ -102,15 +102,9 @@ def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
         xyz, brightness = extract_points(volume, fraction)
         x, y, z = (Column(n, "m", np.ascontiguousarray(xyz[:, i])) for i, n in enumerate("xyz"))
         write_table(path, [x, y, z, Column("brightness", "", brightness)])
-    elif suffix == ".exr":
-        from tofclip.io.light_fields import write_exr_parts
-
-        front = volume.maximum_projection()
-        write_exr_parts({"": {"Y": front.brightness, "Z": front.depth}}, path)
-    else:
-        require_suffix(path, *WRITERS, ".exr", *POINT_SUFFIXES)
-        with atomic_path(path) as temporary:
-            WRITERS[suffix](volume, temporary)
+        return
+    require_suffix(path, *WRITERS, *POINT_SUFFIXES)
+    WRITERS[suffix](volume, Path(path))
 
 
 def _write_vti(volume: Volume, path: Path) -> None:
@@ -126,17 +120,26 @@ def _write_vti(volume: Volume, path: Path) -> None:
     origin = [axis[0] for axis in axes]
     image = pyvista.ImageData(dimensions=volume.grid.shape[::-1], spacing=steps, origin=origin)
     image["brightness"] = volume.magnitude.astype(np.float32).ravel()
-    image.save(path)
+    with atomic_path(path) as temporary:
+        image.save(temporary)
 
 
 def _write_npz(volume: Volume, path: Path) -> None:
     axes: dict[str, Any] = {f"{name}_m": getattr(volume.grid, name) for name in "xyz"}
-    with open(path, "wb") as file:
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, values=to_numpy(volume.values), **axes)
+
+
+def _write_exr(volume: Volume, path: Path) -> None:
+    from tofclip.io.light_fields import write_exr_parts
+
+    front = volume.maximum_projection()
+    write_exr_parts({"": {"Y": front.brightness, "Z": front.depth}}, path)
 
 
 WRITERS: Mapping[str, Callable[[Volume, Path], None]] = {
     ".vti": _write_vti,
     ".npz": _write_npz,
+    ".exr": _write_exr,
 }
 POINT_SUFFIXES = (".ply", ".pcd", ".csv")

@@ -69,14 +69,14 @@ def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, 
     shots of a folder are left out. `bin_width`: duration of a row, s, which overrides time
     axes. `InputError`, `StorageError` or `FileFormatError` where there is none.
     """
-    import h5py
-
     path = Path(source)
     if path.is_dir() or not path.exists():
         return {
             name: FileShot(file, bin_width)
             for name, file in list_files(source, _may_be_shot).items()
         }
+    import h5py
+
     if not h5py.is_hdf5(path):
         raise FileFormatError(
             path,

@@ -234,12 +234,11 @@ def estimate_excess_variance(model: SurfaceModel, amplitude: Image) -> float:
     return float(np.mean(model.weights[lit] * (predicted - model.image)[lit] ** 2))
 
 
-def share_misfit(model: SurfaceModel, amplitude: Image, misfit: Image) -> Image:
+def share_misfit(model: SurfaceModel, amplitude: Image, light: Image, misfit: Image) -> Image:
     """Give each point its part of a misfit, or a change of one, (rows, columns): each measurement's
-    belongs to the points whose light it is.
+    belongs to the points whose `light`, as amplitudes are rendered, it is.
     """
-    light = np.maximum(model.render(amplitude), np.float32(LEAST_COUNT))
-    relative: Image = (misfit / light).astype(np.float32)
+    relative: Image = (misfit / np.maximum(light, np.float32(LEAST_COUNT))).astype(np.float32)
     return amplitude * model.gather(relative)
 
 

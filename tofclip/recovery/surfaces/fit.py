@@ -255,12 +255,13 @@ def straighten_surfaces(
         return solver, None
     ahead = copy.copy(model)
     before, straight = refine_state(ahead, solver.amplitude), bent
+    light = model.render(solver.amplitude)
     while straight:
         trial = model.straighten(straight, solver.amplitude)
         # what amplitudes explain hardly depends on the basis: begun there, but still a first step
         after = refine_state(trial, solver.amplitude, replace(before, steps=0))
         change = model.weights * (after.rest**2 - before.rest**2)
-        excess = share_misfit(model, solver.amplitude, change)
+        excess = share_misfit(model, solver.amplitude, light, change)
         needed = []
         for surface in straight:
             basis, coefficients = ahead.bases[surface], ahead.state.coefficients[surface]

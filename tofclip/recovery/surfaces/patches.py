@@ -108,7 +108,8 @@ def find_patches(
     have several returns.
     """
     found = find_plain_patches(pixels, distance, deviation, ray_length, bin_m)
-    parts = [part for patch in found for part in _part_at_creases(patch, bin_m)]
+    bent = (_bend_where_needed(patch, bin_m) for patch in found)
+    parts = [part for patch in bent for part in _part_at_creases(patch, bin_m)]
     return sorted(parts, key=lambda part: -part.pixels.size)
 
 
@@ -287,33 +288,33 @@ def _bend_where_needed(patch: Patch, bin_m: float) -> Patch:
 
 
 def _part_at_creases(patch: Patch, bin_m: float) -> list[Patch]:
-    """Bend a patch where needed; return its parts where surfaces of their own follow the returns of each
-    far better: things that touch at one range, as a ball and the cable on which it hangs, or two limbs.
+    """Return the parts of a patch, bent where needed as they are, where surfaces of their own follow the
+    returns of each far better: things that touch at one range, as a ball and the cable on which it hangs,
+    or two limbs; else the patch.
     """
-    whole = _bend_where_needed(patch, bin_m)
-    error = whole.compute_error()
+    error = patch.compute_error()
     if error < BEND_BINS * bin_m:
-        return [whole]
+        return [patch]
     if len(pieces := _list_pieces(patch)) > 1:
         bent = [_bend_where_needed(piece, bin_m) for piece in pieces]
         off = [np.abs(one.compute_ranges(one.pixels) - one.distance) for one in bent]
         if np.median(np.concatenate(off)) < BENT_FRACTION * error:
-            return [part for piece in pieces for part in _part_at_creases(piece, bin_m)]
-    if error < CREASE_BINS * bin_m or whole.compute_misfit(whole) < CREASE_SIGMAS:
-        return [whole]
+            return [part for piece in bent for part in _part_at_creases(piece, bin_m)]
+    if error < CREASE_BINS * bin_m or patch.compute_misfit(patch) < CREASE_SIGMAS:
+        return [patch]
     y, x = np.divmod(patch.pixels, patch.ray_length.shape[1])
     best, least = None, CREASE_FRACTION * error
     for across in (x, y, x + y, x - y):
         second = _part_in_two(patch, across > np.median(across), SPLIT_BINS * bin_m)
         if min(second.sum(), (~second).sum()) < MIN_PATCH_PX:
             continue
-        parts = [patch.take(np.flatnonzero(own)) for own in (~second, second)]
-        errors = [_bend_where_needed(part, bin_m).compute_error() for part in parts]
-        left = float(np.average(errors, weights=[part.pixels.size for part in parts]))
+        parts = [_bend_where_needed(patch.take(own), bin_m) for own in (~second, second)]
+        sizes = [part.pixels.size for part in parts]
+        left = float(np.average([part.compute_error() for part in parts], weights=sizes))
         if left < least:
             best, least = parts, left
     if best is None:
-        return [whole]
+        return [patch]
     return [part for half in best for part in _part_at_creases(half, bin_m)]
 
 
@@ -335,7 +336,7 @@ def _part_in_two(patch: Patch, second: NDArray[np.bool_], most: float) -> NDArra
             break
         fits = (patch.take(own).compute_ranges(patch.pixels) for own in (~second, second))
         off = [
-            _average_beside(patch, np.minimum(np.abs(fit - patch.distance), most)) for fit in fits
+            _add_up_beside(patch, np.minimum(np.abs(fit - patch.distance), most)) for fit in fits
         ]
         before, second = second, off[1] < off[0]
         if (before == second).all():
@@ -343,15 +344,12 @@ def _part_in_two(patch: Patch, second: NDArray[np.bool_], most: float) -> NDArra
     return second
 
 
-def _average_beside(patch: Patch, values: FloatArray) -> FloatArray:
-    """Mean of values of returns, (n,), over those of the pixels about each."""
-    pictures = np.zeros((2, *patch.ray_length.shape))
-    np.add.at(pictures[0].ravel(), patch.pixels, values)
-    np.add.at(pictures[1].ravel(), patch.pixels, 1.0)
-    total, count = (
-        scipy.ndimage.uniform_filter(one, NEIGHBOURS_PX, mode="constant") for one in pictures
-    )
-    return np.asarray((total.ravel() / np.maximum(count.ravel(), TINY))[patch.pixels])
+def _add_up_beside(patch: Patch, values: FloatArray) -> FloatArray:
+    """Values of returns, (n,), added up over the pixels about each, on one scale."""
+    picture = np.bincount(patch.pixels, values, patch.ray_length.size)
+    picture = picture.reshape(patch.ray_length.shape)
+    total = scipy.ndimage.uniform_filter(picture, NEIGHBOURS_PX, mode="constant")
+    return np.asarray(total.ravel()[patch.pixels])
 
 
 def _give_splines(patch: Patch) -> Patch:

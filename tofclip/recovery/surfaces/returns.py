@@ -136,24 +136,24 @@ def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]
     solver, sparse, model, seen = fit.solver, fit.sparse, fit.solver.model, fit.seen
     variance = solver.estimate_local_variance()
     shown = find_candidates(solver, solver.measure_significance(variance), limit)
-    before, after = ((model.image - model.render(one.amplitude)) ** 2 for one in (solver, sparse))
-    worse = share_misfit(model, solver.amplitude, model.weights / variance * (after - before))
+    light, sparsely = (model.render(one.amplitude) for one in (solver, sparse))
+    change = (model.image - sparsely) ** 2 - (model.image - light) ** 2
+    worse = share_misfit(model, solver.amplitude, light, model.weights / variance * change)
     place = partial(scipy.ndimage.uniform_filter, size=NEIGHBOURHOOD_PX, mode="constant")
     worse = np.maximum(NEIGHBOURHOOD_PX**2 * solver.map_pictures(place, worse), 0)
     # Where dim light is costly, a point is needed by the light that stays there, on whichever surface, and
     # by how much worse the shot is explained without what does not.
-    stays = _add_up_near(model, sparse.amplitude)
-    stays /= np.maximum(_add_up_near(model, solver.amplitude), TINY)
+    stays, all_near = _add_up_near(model, np.array([sparse.amplitude, solver.amplitude]))
     sparse = copy.copy(sparse)
-    sparse.amplitude = (stays * solver.amplitude).astype(np.float32)
+    sparse.amplitude = (stays / np.maximum(all_near, TINY) * solver.amplitude).astype(np.float32)
     needed = np.sqrt(sparse.measure_significance(variance) ** 2 + worse)
     # Light of a line of one range may lie anywhere in a lens about it: of such a surface the two
     # explanations are unlike where they are as probable.
     moved = np.maximum(solver.amplitude - sparse.amplitude, 0) * np.exp(-worse / 2)
-    lost, light = (
+    lost, whole = (
         np.bincount(model.surface, one, len(model.parts)) for one in (moved, solver.amplitude)
     )
-    elsewhere = np.clip(lost / np.maximum(light, TINY), LEAST_ELSEWHERE, MOST_ELSEWHERE)
+    elsewhere = np.clip(lost / np.maximum(whole, TINY), LEAST_ELSEWHERE, MOST_ELSEWHERE)
     bright, brightest = sparse.compare_places()
 
     points = model.row[shown], model.column[shown], model.distance[shown]
@@ -174,14 +174,17 @@ def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]
     return np.flatnonzero(shown), np.array(known)
 
 
-def _add_up_near(model: SurfaceModel, amplitude: Image) -> FloatArray:
-    """The light that lies in each point's pixel about its range, of all surfaces."""
+def _add_up_near(model: SurfaceModel, amplitudes: Image) -> FloatArray:
+    """The light that lies in each point's pixel about its range, of all surfaces, by each of some
+    amplitudes, (n, points).
+    """
     reach = NEAR_BINS * model.row_m
     place = model.pixel * (model.distance.max() + 2 * reach) + model.distance
     order = np.argsort(place)
-    total = np.append(0, np.cumsum(amplitude[order], dtype=np.float64))
+    total = np.zeros((len(amplitudes), order.size + 1))
+    np.cumsum(amplitudes[:, order], axis=1, dtype=np.float64, out=total[:, 1:])
     first, last = (np.searchsorted(place[order], place + away) for away in (-reach, reach))
-    return np.asarray(total[last] - total[first])
+    return np.asarray(total[:, last] - total[:, first])
 
 
 def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
