@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from typing import Any, NamedTuple, TypeVar
@@ -43,6 +43,7 @@ from tofclip.shots import Streak
 from tofclip.threads import map_parallel, split_blocks, thread_count
 from tofclip.units import SPEED_OF_LIGHT
 
+Job = TypeVar("Job")
 Result = TypeVar("Result")
 Box = tuple[NDArray[np.int64], slice]  # rows, ascending, and columns
 
@@ -516,9 +517,18 @@ class SurfaceModel:
 
     def share_out(self, work: Callable[[range], Result], jobs: int) -> list[Result]:
         """Return ``work(share)`` of each thread's share of all views or surfaces."""
-        threads = 1 if self.surface.size < PARALLEL_POINTS else thread_count()
+        threads = thread_count() if self.is_large else 1
         shares = [range(jobs)[own] for own in split_blocks(jobs, -(-jobs // threads))]
-        return list(map_parallel(work, shares))
+        return list(self.map(work, shares))
+
+    def map(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
+        """Yield ``work(job)`` for each view or surface, on several threads if it is worth them."""
+        return map_parallel(work, jobs) if self.is_large else map(work, jobs)
+
+    @property
+    def is_large(self) -> bool:
+        """Whether threads are worth their beginning."""
+        return self.surface.size >= PARALLEL_POINTS
 
     def receive(
         self, view: int, amplitude: Image, kernel: Image, part: slice = slice(None)

@@ -25,7 +25,6 @@ from tofclip.recovery.surfaces.amplitudes import TINY, explain_by_amplitude, sca
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, Window
 from tofclip.recovery.surfaces.pulse import Image, differentiate_pulse
 from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, QuadricBasis
-from tofclip.threads import map_parallel
 from tofclip.units import SPEED_OF_LIGHT
 
 WIDTH_STEP = 0.02  # relative; for the derivative by a pulse's width
@@ -94,7 +93,7 @@ def iterate_derivatives(model: SurfaceModel, amplitude: Image) -> Iterator[Deriv
         (_differentiate_borders, range(1)),
         (_differentiate_surface, surfaces),
     ):
-        parts = map_parallel(partial(work, model, amplitude), numbers)
+        parts = model.map(partial(work, model, amplitude), numbers)
         yield from itertools.chain.from_iterable(parts)
 
 
@@ -559,7 +558,7 @@ def _eliminate_amplitude(
         return [*_join_windows(model, names, windows)]
 
     patterns = []
-    explained = map_parallel(explain, range(len(model.masks)))
+    explained = model.map(explain, range(len(model.masks)))
     # the same points, and so the same parts of the image
     for group, seen in zip(own, itertools.chain.from_iterable(explained), strict=True):
         surface = group.names[0][1]
