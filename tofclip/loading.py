@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from importlib import import_module
 from pathlib import Path
@@ -11,10 +12,17 @@ from tofclip.errors import require_path
 from tofclip.files import guard, translate_read_errors
 from tofclip.io import read_streak
 from tofclip.io.archive import Archive
-from tofclip.io.light_fields import read_exr_parts
+from tofclip.io.light_fields import read_exr_parts, read_light_field
 from tofclip.io.streaks import outline_streak_file
 from tofclip.lidar import PointCloud
-from tofclip.storage import HDF5_SIGNATURE, Field, Record, make_stand_in, read_outline
+from tofclip.storage import (
+    HDF5_SIGNATURE,
+    Field,
+    Record,
+    is_own_file,
+    make_stand_in,
+    read_outline,
+)
 
 # Where the object of each kind of record is made; `nlos` is named, not imported: it builds on this
 # package, as do recordings' readers.
@@ -30,18 +38,19 @@ HOMES = {
     "volume": ("nlos", "Volume"),
 }
 CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57")
-EXR_SIGNATURE, NPZ_SIGNATURE = b"\x76\x2f\x31\x01", b"PK\x03\x04"
+EXR_SIGNATURE, MATLAB_SIGNATURE, NPZ_SIGNATURE = b"\x76\x2f\x31\x01", b"MATLAB", b"PK\x03\x04"
 
 
 def load(path: str | Path) -> Any:
-    """Open a file of ours, whatever it holds, or a streak image of another program.
+    """Open a file of ours, whatever it holds, or a streak image or capture of others.
 
     Parameters
     ----------
     path : path-like
         HDF5, a point cloud in any format that `PointCloud.save` writes, a range image of
-        ``tofclip lidar photons``, a depth picture (OpenEXR), a recording, settings (TOML), or what
-        `read_streak` reads.
+        ``tofclip lidar photons``, a depth picture (OpenEXR), a recording, settings (TOML), a light
+        field's ``.npz`` (`lf`, `u`, `v`, `scale`), or what `read_streak` and
+        `nlos.io.read_capture` read.
 
     Returns
     -------
@@ -87,6 +96,15 @@ def _open(path: str | Path, values: bool) -> tuple[Record, Any]:
     head = import_module("devices.recording.read").read_head_if_recording(file)
     if head is not None:
         return head, None
+    if start.startswith((NPZ_SIGNATURE, MATLAB_SIGNATURE)) or (
+        start == HDF5_SIGNATURE and not is_own_file(file)
+    ):
+        captures = import_module("nlos.io.format_detection")
+        arrays = captures.list_capture_arrays(file, start)
+        if arrays is not None and values:
+            return Record(""), captures.read_capture(file)
+        if arrays is not None:
+            return Record("capture", _outline_arrays(arrays), origin=str(file)), None
     if start == HDF5_SIGNATURE:
         return (Record.load if values else read_outline)(file), None
     if start.startswith(EXR_SIGNATURE):
@@ -101,6 +119,10 @@ def _open(path: str | Path, values: bool) -> tuple[Record, Any]:
         is_cloud = is_cloud and not archive.names.isdisjoint(("x", "x_m"))  # else maybe a LIFT shot
         if not is_cloud and "range_m" in archive:
             return _open_range_image(archive, values), None
+        if not is_cloud and archive.names.issuperset(("lf", "u", "v")):
+            if values:
+                return Record(""), read_light_field(file)
+            return Record("light_field", _outline_arrays(archive), origin=str(file)), None
     if values:
         return Record(""), PointCloud.load(file) if is_cloud else read_streak(file)
     return PointCloud.read_outline(file) if is_cloud else outline_streak_file(file), None
@@ -115,6 +137,16 @@ def _open_range_image(archive: Archive, values: bool) -> Record:
         content = archive.read(name) if values else make_stand_in(entry.shape, entry.dtype)
         fields[name] = Field(content, units, ("y", "x", "return")[: len(entry.shape)])
     return Record("range image", fields, origin=str(archive.path))
+
+
+def _outline_arrays(archive: Archive) -> dict[str, Field]:
+    entries = {name: archive.describe(name) for name in sorted(archive.names)}
+    return {
+        name: Field(
+            make_stand_in(one.shape, one.dtype) if math.prod(one.shape) > 1 else archive.read(name)
+        )
+        for name, one in entries.items()
+    }
 
 
 def _open_depth_picture(file: Path) -> Record:

@@ -153,9 +153,9 @@ class Record:
         """Read a record, refusing any other kind than those named (none named: any kind)."""
         require_path(path)
         wanted = f", expected {' or '.join(kinds)}" if kinds else ""
-        wanted += (
-            " (run tofclip recover first)" if "frames" in kinds and "streak" not in kinds else ""
-        )
+        for kind, verb in {"frames": "recover", "clip_measurement": "clip simulate"}.items():
+            if kind in kinds and "streak" not in kinds:
+                wanted += f" (run tofclip {verb} first)"
         record = _read_file(path, wanted=wanted)
         if kinds and record.kind not in kinds:
             raise FileFormatError(path, f"holds a {record.kind} record{wanted}")

@@ -132,10 +132,10 @@ def open_source(
         return _open_shots(path.name, [partial(read, path)], options, announce)
     if kind == "recording":
         return _open_instrument(f"file://{path}", options, announce)
-    verb = {"camera": "tofclip info", "capture": "tofclip nlos reconstruct"}.get(kind)
-    advice = f"; {verb} reads it" if verb else ""
+    verb = {"capture": "nlos reconstruct", "light_field": "clip simulate"}.get(kind, "info")
     raise FileFormatError(
-        path, f"holds a {kind} record; frames, clouds, volumes and shots can be looked at{advice}"
+        path,
+        f"holds a {kind} record; frames, clouds, volumes and shots can be looked at; tofclip {verb} reads it",
     )
 
 

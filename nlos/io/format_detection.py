@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,23 @@ def read_capture(path: str | Path) -> Capture:
     if capture.provenance:
         return capture
     return replace(capture, provenance=collect_provenance({"verb": "read_capture"}, path))
+
+
+def list_capture_arrays(path: Path, start: bytes) -> NamedArrays | None:
+    """List the arrays of a file of named arrays whose first bytes are `start`, none read, if their
+    names say that it is a capture; ``data`` or ``meas`` alone may as well be counted photons.
+    """
+    for signature, list_arrays, formats in (
+        (NPZ.signatures[0], NamedArrays, ARCHIVE_FORMATS),
+        (MATLAB.signatures[0], read_matlab, MATLAB_FORMATS),
+        (HDF5_SIGNATURE, read_hdf5, HDF5_FORMATS),
+    ):
+        with suppress(FileFormatError):  # its own reader says best what is damaged
+            if start.startswith(signature):
+                arrays = list_arrays(path)
+                telling = set(formats) - {("data",), ("meas",)}
+                return arrays if any(map(arrays.names.issuperset, telling)) else None
+    return None
 
 
 def _read_archive(path: Path) -> Capture:

@@ -26,6 +26,7 @@ from tofclip.arrays import AnyArray, Float32Array, FloatArray
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import require_bounded_dataset, translate_read_errors
 from tofclip.io.archive import Archive, ArchiveEntry, Entries, list_mat_entries
+from tofclip.shots import RELAY_WALL
 from tofclip.storage import HDF5_SIGNATURE
 from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
 
@@ -460,7 +461,10 @@ def read_lift_archive(path: str | Path) -> Capture:
     from tofclip.io import read_streak
     from tofclip.recovery import recover
 
-    return Capture.from_frames(recover(read_streak(path), method="linear"))
+    shot = read_streak(path)
+    if RELAY_WALL not in shot.attachments:
+        raise FileFormatError(path, "is a shot of no relay wall ('wall_grid_m'): no capture")
+    return Capture.from_frames(recover(shot, method="linear"))
 
 
 def read_phasor_field_data(fields: NamedArrays) -> Capture:

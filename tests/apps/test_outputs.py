@@ -320,6 +320,37 @@ def test_every_output_is_opened(shell, written, name, kind):
         assert any(word in said for word in ("camera", kind, "is not a streak image"))
 
 
+OTHERS = {
+    "capture": (
+        "nlos reconstruct",
+        {
+            "H": np.ones((9, 4, 4)),
+            "wall_xyz": np.random.default_rng(0).random((4, 4, 3)),
+            "laser_xyz": np.zeros(3),
+            "delta_t_s": 4e-12,
+        },
+    ),
+    "light_field": (
+        "clip simulate",
+        {"lf": np.arange(64).reshape(2, 2, 4, 4), "u": [-1, 0], "v": [-1, 0], "scale": 0.5},
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_archives_of_others_say_what_they_are(shell, here, kind):
+    verb, arrays = OTHERS[kind]
+    np.savez("other.npz", **arrays)
+    told = shell.figures("info other.npz")
+    assert told["kind"] == kind
+    assert set(told["fields"]) == set(arrays)
+    numbers = {name: one["values"] for name, one in told["fields"].items() if "values" in one}
+    assert numbers == {name: one for name, one in arrays.items() if isinstance(one, float)}
+    assert tofclip.load("other.npz").to_record().kind == kind
+    assert f"tofclip {verb} reads it" in shell.refuses("view other.npz --png view.png")
+    assert "so it is no streak image" in shell.refuses("recover other.npz --out f.h5")
+
+
 def test_clouds_of_every_format_are_layers_of_one_scene(shell, written):
     names = " ".join(f"{written}/{name}" for name in CLOUDS)
     points = len(tofclip.load(written / CLOUDS[0]))

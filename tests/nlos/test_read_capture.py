@@ -124,6 +124,7 @@ def test_the_recorded_archives(shared_data):
     letter = read_capture(shared_data / "lift" / "nlos_LetterN.npz")
     assert letter.signal.shape == (1016, 125, 125)
     assert letter.bin_width == pytest.approx(4.6e-12)
+    refused(shared_data / "lift" / "lif_dof_LinearFiber_vertical.npz", "a shot of no relay wall")
 
 
 # --- y-tal and Zaragoza

@@ -125,6 +125,10 @@ def open_lift(path: str | Path) -> Iterator[StreakFile]:
     from it the camera's focal length.
     """
     archive = Archive(path)
+    if "streak_raw" not in archive:
+        found = ", ".join(sorted(archive.names)[:8])
+        problem = "has no field 'streak_raw', so it is no streak image"
+        raise FileFormatError(path, f"{problem}; it holds {found}")
     for flag, meant in EXPECTED_FLAGS.items():
         if archive.array(flag) != meant:
             raise FileFormatError(

@@ -59,6 +59,10 @@ class LightField(Storable):
             "a light field whose pictures are all one even tone shows nothing to recover",
         )
 
+    def __repr__(self) -> str:
+        views, rows, columns = self.pictures.shape
+        return f"LightField({views} views of {rows} x {columns} pixels)"
+
     def refocus(self, shear: float, reference: tuple[float, float] = (0.0, 0.0)) -> AnyArray:
         """Shift and add: each view is shifted back by the `shear`, pixels per view step, and the mean
         taken of those that see the pixel, (rows, columns) float32, of the picture of view
