@@ -124,6 +124,24 @@ def test_derivatives_of_a_round_surface_are_those_of_differences():
         np.testing.assert_allclose(found[:, number], (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-6)
 
 
+def test_a_round_surface_moves_as_its_derivatives_say():
+    """l and q make up for each other nearly: what hardly changes a ball is a long way in both."""
+    basis = QuadricBasis((40, 50), (5, 8, 35, 42), unit=0.02)
+    coefficients = np.array([0.3, 0.0, 0.0, 0.1, 0.0, 0.0, -0.1, 0.0, -0.1])
+    functions = basis.evaluate(np.arange(40 * 50))
+    light = (functions @ coefficients[3:] > 0.01).astype(np.float32)
+    derivatives = basis.differentiate(functions, coefficients)[light > 0]
+    way = np.linalg.svd(derivatives / np.linalg.norm(derivatives, axis=0))[2][-1]
+    way /= np.linalg.norm(derivatives, axis=0)
+    change = 0.02 * way / abs(way[0])  # of l, where the ball rises by 0.06
+    ends = coefficients + change, basis.take_step(functions, coefficients, change, light)
+    aim = basis.compute_inverse(functions, coefficients)[light > 0] + derivatives @ change
+    plain, taken = (
+        np.abs(basis.compute_inverse(functions, end)[light > 0] - aim).mean() for end in ends
+    )
+    assert taken < 0.2 * plain
+
+
 def test_splines_are_a_quadratic_and_what_bends():
     """Cubic splines hold every quadratic, so that taking it apart and together changes nothing."""
     shape = (40, 50)

@@ -32,7 +32,6 @@ CLUSTER_ROWS, CLUSTER_COLUMNS = 12, 48  # measurements whose misfits may depend 
 LEAST_VARIANCE = 1e-12  # of the largest one
 MAX_LEVERAGE = 0.9  # of a cluster: what it alone determines, its misfit says nothing about
 SMALLEST_STEP = 1 / 16  # of a Gauss-Newton step, halved until it lowers the misfit
-REMEMBERED_STEPS = 2  # from which the next one's length is taken
 # Rows by which each view's part of a sweep that was found from the shot is off: root mean squares of
 # scenes by a forward model of their own (0.015 and 0.05 in the demonstration). Later views and farther
 # surfaces look alike, so that the mean over the views is what all ranges have in common.
@@ -49,7 +48,7 @@ CENTRE_SIGMA_PX, DISPLACEMENT_SIGMA_PX = 0.3, 1e-3
 MIN_SHADING, SHADING_SIGMAS = 0.1, 3.0
 # Of conjugate gradients. Smooth changes of amplitude, which matter for a derivative, converge first,
 # and those of the last step are nearly right.
-ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 12, 4
+ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 6, 2
 # What the prior takes from amplitudes is as fine as they are. After 6 the ranges of a wall behind
 # wires were 0.009 mm too near, without noise and with the model exact; after 15, 0.0005 mm.
 FREE_ITERATIONS, FURTHER_FREE_ITERATIONS, MOVED_FREE_ITERATIONS = 15, 6, 3
@@ -260,15 +259,19 @@ class NormalEquations:
         for score, cluster in zip(scores, self.clusters, strict=True):
             score[cluster.numbers] = cluster.score
         influence, covariance = scores @ inverse, inverse @ known @ inverse
-        surfaces = np.array([n if name == "coefficients" else -1 for name, n, _ in self.names])
+        ranges = "coefficients", "patterns"
+        surfaces = np.array([number if name in ranges else -1 for name, number, _ in self.names])
         for surface in np.unique(surfaces[surfaces >= 0]):
             part = np.flatnonzero(surfaces == surface)
             factor, inverse_factor = _take_root(inverse[np.ix_(part, part)])
             own = [surfaces[cluster.numbers] == surface for cluster in self.clusters]
             says = np.flatnonzero([one.any() for one in own])
-            said = np.array(
-                [self.clusters[one].information[np.ix_(own[one], own[one])] for one in says]
-            )
+            said = np.zeros((says.size, part.size, part.size))
+            for information, one in zip(said, says, strict=True):
+                # a cluster may say nothing of some
+                place = np.searchsorted(part, self.clusters[one].numbers[own[one]])
+                whole = self.clusters[one].information
+                information[np.ix_(place, place)] = whole[np.ix_(own[one], own[one])]
             leverage, axes = np.linalg.eigh(factor.T @ said @ factor)
             left = np.sqrt(1 - np.clip(leverage, 0, MAX_LEVERAGE))
             along = influence[np.ix_(says, part)] @ inverse_factor.T
@@ -304,30 +307,6 @@ class Refinement:
     rest: Image
     # amplitudes that explain this shot best without the prior, if it is this shot's step
     free: Image | None
-    history: tuple[Step, ...] = ()  # the last steps on this shot, the last one first
-
-
-class Step(NamedTuple):
-    """A step as Gauss and Newton have it, and as it was taken, (unknowns,) both."""
-
-    names: list[Unknown]
-    newton: FloatArray
-    taken: FloatArray
-
-
-def lengthen_step(change: FloatArray, history: Sequence[Step], metric: FloatArray) -> FloatArray:
-    """Return a step from what it and those before it have in common. What amplitudes can explain of views
-    that are late makes each too short, by the same fraction along the same directions: the sum of these
-    that is nearest to none leads where steps would end (D. Anderson, J. ACM 12, 547, 1965). `metric`:
-    of the normal equations, (unknowns, unknowns).
-    """
-    newton = [change, *(step.newton for step in history)]
-    changed = np.array([a - b for a, b in itertools.pairwise(newton)])
-    weighted = changed @ metric
-    known = weighted @ changed.T
-    shares, *_ = np.linalg.lstsq(known, weighted @ change, rcond=None)
-    taken = np.array([step.taken for step in history])
-    return np.asarray(change - shares @ (taken + changed))
 
 
 def refine_state(
@@ -374,9 +353,6 @@ def refine_state(
     whole = (equations.normal + second) / np.outer(unit, unit) + RIDGE * np.eye(unit.size)
     inverse = np.linalg.inv(whole) / np.outer(unit, unit)
     newton = inverse @ (equations.slope - first)
-    history = () if earlier is None or earlier.free is None else earlier.history
-    history = tuple(itertools.takewhile(lambda step: step.names == names, history))
-    longer = [lengthen_step(newton, history, equations.normal + second)] if history else []
     covariance = inverse
     if robust:
         covariance = equations.estimate_covariances(inverse, second)
@@ -393,13 +369,12 @@ def refine_state(
     moved, free, rest = amplitude, amplitude + settled, left
     halved = np.outer(0.5 ** np.arange(1 - np.log2(SMALLEST_STEP)), newton)
     with np.errstate(over="ignore", invalid="ignore"):
-        for taken in (*longer, *halved):
+        for taken in halved:
             ahead = _move(model, state, amplitude, names, taken, changes)
             error = model.image - model.render(ahead)
             settled, left = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
             if compute_objective(model, left) < before:
                 moved, free, rest = ahead, ahead + settled, left
-                history = (Step(names, newton, taken), *history)
                 break
         else:
             model.place(state)
@@ -408,7 +383,7 @@ def refine_state(
     covariances = [covariance[block] for block in own]
     steps = 1 if earlier is None else earlier.steps + 1
     model.weights = given
-    return Refinement(covariances, moved, changes, steps, rest, free, history[:REMEMBERED_STEPS])
+    return Refinement(covariances, moved, changes, steps, rest, free)
 
 
 def doubt_borders(model: SurfaceModel, amplitude: Image) -> Image:
@@ -518,10 +493,11 @@ def _eliminate_amplitude(
     Splines bend less than amplitudes could follow, but what of them is a quadratic does not.
 
     Returns `changes` (9, points): x for each coefficient of a quadratic, or of a surface of second
-    order in space; and derivatives by the first of these changes of each surface's amplitude,
-    ("patterns", surface, 0): what amplitudes can explain of views that are all late is an unknown of
-    its own. Taken for what only late views explain, it would make steps too short and ranges surer
-    than they are.
+    order in space; and derivatives by these changes of each surface's amplitude, ("patterns",
+    surface, number). Things of one range, as head and arms, do share measurements: of one of them
+    alone amplitudes, its own and the others', explain more than of all together. What they explain is
+    an unknown of its own; taken for what only late views explain, it would make steps too short and
+    ranges surer than they are.
     """
     own = [group for group in groups if group.names[0][0] == "coefficients"]
     shares = [basis.quadratic_parts for basis in model.bases]
@@ -564,9 +540,7 @@ def _eliminate_amplitude(
         surface = group.names[0][1]
         _, quadratic = shares[surface]
         group.images[...] -= np.tensordot(quadratic.T.astype(np.float32), seen.images, 1)
-        patterns.append(
-            seen._replace(names=[("patterns", surface, 0)], images=seen.images[:1].copy())
-        )
+        patterns.append(seen._replace(names=[("patterns", *name[1:]) for name in seen.names]))
     return changes, patterns
 
 
@@ -625,16 +599,20 @@ def _move(
     """Place the model where a step leads from a state; return the amplitudes that go along."""
     moved, ahead = state.copy(), amplitude.copy()
     for (name, surface, number), value in zip(names, change, strict=True):
-        if name != "patterns":
+        if name not in ("coefficients", "patterns"):
             values = getattr(moved, name)
-            values = values[surface] if name in ("coefficients", "shading") else values
+            values = values[surface] if name == "shading" else values
             # gains and widths change relatively
             values[number] += value * (values[number] if name in ("gains", "widths") else 1.0)
-    for surface, part in enumerate(model.parts):
-        own = [i for i, name in enumerate(names) if name[:2] == ("coefficients", surface)]
-        _, quadratic = model.bases[surface].quadratic_parts
-        along = -quadratic @ change[own]
-        along[0] += change[names.index(("patterns", surface, 0))]
+    for surface, (part, basis) in enumerate(zip(model.parts, model.bases, strict=True)):
+        own, explained = (
+            change[[i for i, unknown in enumerate(names) if unknown[:2] == (name, surface)]]
+            for name in ("coefficients", "patterns")
+        )
+        moved.coefficients[surface] = basis.take_step(
+            model.functions[surface], state.coefficients[surface], own, amplitude[part]
+        )
+        along = explained - basis.quadratic_parts[1] @ own
         ahead[part] += along.astype(np.float32) @ changes[: along.size, part]
     # the mean gain is the amplitudes' unit, and so is the mean brightness behind a surface
     brighter, shading = moved.gains.mean() / state.gains.mean(), moved.shading.mean(axis=1)

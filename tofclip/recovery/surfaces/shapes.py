@@ -20,6 +20,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
+from tofclip.recovery.surfaces.pulse import Image
 
 Pixels = NDArray[np.intp]
 
@@ -79,6 +80,12 @@ class SmoothBasis:
     def differentiate(self, functions: FloatArray, coefficients: FloatArray) -> FloatArray:
         """Return the derivatives of inverse depths by the coefficients, (pixels, n)."""
         return functions
+
+    def take_step(
+        self, functions: FloatArray, coefficients: FloatArray, change: FloatArray, light: Image
+    ) -> FloatArray:
+        """Return the coefficients after a change, (n,); `light`: of the pixels."""
+        return coefficients + change
 
     @cached_property
     def quadratic_parts(self) -> tuple[FloatArray, FloatArray]:
@@ -150,6 +157,30 @@ class QuadricBasis(SmoothBasis):
         by_q += (LIMB * change / size)[:, None] * by_limb
         by_q /= (4 * np.sqrt(inside / 2))[:, None]
         return np.concatenate([functions[:, :LINEAR], self.sign * by_q], axis=1)
+
+    def take_step(
+        self, functions: FloatArray, coefficients: FloatArray, change: FloatArray, light: Image
+    ) -> FloatArray:
+        """The same, so that inverse depths change as their derivatives say, as nearly as those of a
+        surface of second order can where there is light. Along what a shot hardly says anything about
+        l and q make up for each other, but only in small steps: q by a square.
+        """
+        lit = np.flatnonzero(light)
+        if lit.size < coefficients.size:
+            return coefficients + change
+        some = lit[:: 1 + lit.size // FITTED_RETURNS]
+        functions, sure = functions[some], np.sqrt(light[some].astype(np.float64) / light.max())
+        aim = self.compute_inverse(functions, coefficients)
+        aim = aim + self.differentiate(functions, coefficients) @ change
+        found = scipy.optimize.least_squares(
+            lambda own: sure * (self.compute_inverse(functions, own) - aim) / self.unit,
+            coefficients,
+            lambda own: sure[:, np.newaxis] * self.differentiate(functions, own) / self.unit,
+            method="lm",
+            x_scale="jac",
+            max_nfev=FIT_STEPS,
+        )
+        return np.asarray(found.x)
 
     def _round_off(self, functions: FloatArray, coefficients: FloatArray) -> tuple[Any, ...]:
         """Twice the square of the root, which is q inside and rounded off at the limb; its size there;
