@@ -376,6 +376,9 @@ def _run(words: Sequence[str], debug: bool) -> Any:
         status = 0 if text else app(words, prog_name=PROGRAM, standalone_mode=False)
         sys.stdout.flush()
     except Exception as fault:
+        # while a class is made, Python up to 3.11 turns a Ctrl-C into a RuntimeError
+        if isinstance(fault.__cause__, KeyboardInterrupt):
+            return EXIT_INTERRUPTED
         if debug:
             traceback.print_exc()
         return _report_error(fault)

@@ -201,6 +201,13 @@ class TestInterruption:
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (130, "", 1)
         assert done.stderr.startswith("tofclip: interrupted")
 
+    def test_ctrl_c_while_a_class_is_made_is_no_defect(self, tmp_path):
+        late = "class Late:\n def __set_name__(self, *_):\n  raise KeyboardInterrupt\n"
+        (tmp_path / "h5py.py").write_text(f"{late}class Owner:\n late = Late()\n")
+        (tmp_path / "there.h5").touch()
+        done = start([*PROGRAM, "info", "there.h5"], tmp_path, tmp_path)
+        assert (done.returncode, done.stderr.count("\n")) == (130, 1)
+
     def test_little_is_loaded_before_a_ctrl_c_can_be_caught(self, tmp_path):
         (tmp_path / "lazy_loader.py").write_text("raise KeyboardInterrupt\n")
         done = start([*PROGRAM, "--version"], tmp_path, tmp_path)
