@@ -130,7 +130,8 @@ class Accumulation(Options):
             return BinAxis(width, self.bins, start, period)
         if period is None:
             raise InputError(
-                "the laser's period is not known: add period_ps=... or bins=... to the address"
+                "the laser's period is not known: add period_ps=... or bins=... to the address, "
+                "which for a recording is 'file://run.h5?period_ps=...'"
             )
         if not 0 < width <= period:
             raise InputError(
