@@ -21,11 +21,11 @@ NORM_MARGIN = 1.1
 EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
 # Of light beside brighter light of its surface: the sides of the squares whose mean is a place's brightness
-# and in which the brightest counts, the part of that below which a place is dim, after how many
-# iterations what is dim is looked for anew, and by how little, as a logarithm, light may have changed
-# since, on average, to be left as it is; what counts as none, in deviations of a pixel's noise
+# and in which the brightest counts, the part of that below which a place is dim, and after how many
+# iterations what is dim is looked for anew
 PLACE_PX, BESIDE_PX, DIM_PART, REWEIGHT_ITERATIONS = 3, 15, 0.75, 10
-SETTLED_CHANGE, NO_LIGHT_SIGMAS = 0.01, 0.02
+# Deviations of a pixel's noise: iterations that change each surface by less, root mean square, are enough
+SETTLED_SIGMAS = 0.003
 MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 TINY = float(np.finfo(np.float32).tiny)
@@ -115,7 +115,8 @@ class AmplitudeSolver:
         and total variation favours the lens, which is dimmer. `against_dim` is what light costs at places
         that are dark beside the brightest of their surface nearby, in standard deviations as `weight`
         (reweighted l1, E. Candes and others, J. Fourier Anal. Appl. 14, 877, 2008): the lens gives way
-        from its border inwards, and what the shot needs stays. It ends early where light hardly changes.
+        from its border inwards, and what the shot needs stays. It ends early where no surface's light
+        changes any more.
         """
         model = self.model
         steps = 1 / (NORM_MARGIN * self._estimate_norms())
@@ -129,23 +130,22 @@ class AmplitudeSolver:
         )
         weights = self.weight * noise
         step = steps[model.surface].astype(np.float32)
-        deviation, light = np.sqrt(information), None
+        deviation, sizes = np.sqrt(information), np.bincount(model.surface)
         ahead, age, cost = self.amplitude, 1.0, np.zeros_like(step)
         for number in range(iterations):
             if against_dim and number % REWEIGHT_ITERATIONS == 0:
-                before = light
-                light = np.log(np.maximum(self.amplitude * deviation, NO_LIGHT_SIGMAS))
-                if before is not None and np.mean(np.abs(light - before)) < SETTLED_CHANGE:
-                    break
                 cost = self._cost_dim(against_dim, deviation)
             slope = model.pull(ahead, model.image) + cost
             moved = self._shrink(ahead - step * slope, weights * steps)
             if np.sum((ahead - moved) * (moved - self.amplitude)) > 0:
                 age = 1.0  # the momentum points uphill (O'Donoghue and Candes, 2015)
-            older = (1 + np.sqrt(1 + 4 * age**2)) / 2
-            ahead = moved + np.float32((age - 1) / older) * (moved - self.amplitude)
+            older, change = (1 + np.sqrt(1 + 4 * age**2)) / 2, moved - self.amplitude
+            ahead = moved + np.float32((age - 1) / older) * change
             self.amplitude, age = moved, older
             tick()
+            squares = np.bincount(model.surface, (change * deviation) ** 2)
+            if np.all(squares <= SETTLED_SIGMAS**2 * sizes):
+                break
         self.variance = estimate_excess_variance(model, self.amplitude)
 
     def _cost_dim(self, sigmas: float, noise: Image) -> Image:
@@ -209,20 +209,14 @@ def pool_information(information: Image, picture: Image) -> Image:
     has made as bright: where little is known of each pixel it leaves large even pieces, whose
     amplitude all their pixels determine.
     """
+    from tofclip.recovery.surfaces.kernels import add_up_even
 
-    def add_up(values: Image, side: int) -> Image:
-        mean: Image = scipy.ndimage.uniform_filter(values, side, mode="constant")
-        return side**2 * mean
-
-    pooled = add_up(information, NEIGHBOURHOOD_PX)
-    lit, level = picture > 0, np.zeros(picture.shape, np.intp)
-    level[lit] = np.floor(np.log(picture[lit]) / np.log(EVEN_RATIO)).astype(np.intp)
-    for one in np.unique(level[lit]):
-        even = lit & (np.abs(level - one) <= 1)
-        own = lit & (level == one)
-        wide = add_up(np.where(even, information, 0), EVEN_PX)
-        pooled[own] = np.maximum(pooled[own], wide[own])
-    return pooled
+    mean = scipy.ndimage.uniform_filter(information, NEIGHBOURHOOD_PX, mode="constant")
+    lit, level = picture > 0, np.zeros_like(picture)
+    level[lit] = np.floor(np.log(picture[lit]) / np.log(EVEN_RATIO))
+    even = np.zeros_like(information)
+    add_up_even(np.where(lit, information, 0), level, lit, EVEN_PX // 2, even)
+    return np.asarray(np.maximum(NEIGHBOURHOOD_PX**2 * mean, even))
 
 
 def estimate_excess_variance(model: SurfaceModel, amplitude: Image) -> float:

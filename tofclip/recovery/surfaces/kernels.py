@@ -147,6 +147,23 @@ def smooth_rows(images, kernel, lags, rows, below, aside, results):
                 tap += 4
 
 
+@fast_loop
+def add_up_even(values, level, lit, reach, totals):
+    """Add up the values of pixels in the square about each that is lit whose level is the same or next."""
+    rows, columns = values.shape
+    for y in range(rows):
+        for x in range(columns):
+            if not lit[y, x]:
+                continue
+            own, total = level[y, x], np.float32(0)
+            left, right = max(x - reach, 0), min(x + reach + 1, columns)
+            for i in range(max(y - reach, 0), min(y + reach + 1, rows)):
+                line, beside = values[i, left:right], level[i, left:right]
+                for j in range(line.size):
+                    total += line[j] if abs(beside[j] - own) <= 1 else np.float32(0)
+            totals[y, x] = total
+
+
 def prox_masked_tv(
     picture: Image,
     mask: NDArray[np.bool_],

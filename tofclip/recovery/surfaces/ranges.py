@@ -24,7 +24,7 @@ from tofclip.camera import Camera
 from tofclip.recovery.surfaces.amplitudes import TINY, explain_by_amplitude, scale_amplitude
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, Window
 from tofclip.recovery.surfaces.pulse import Image, differentiate_pulse
-from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, QuadricBasis
+from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, Pixels, QuadricBasis
 from tofclip.units import SPEED_OF_LIGHT
 
 WIDTH_STEP = 0.02  # relative; for the derivative by a pulse's width
@@ -222,27 +222,28 @@ class NormalEquations:
         """
         names = list(dict.fromkeys(name for group in groups for name in group.names))
         number = {name: place for place, name in enumerate(names)}
+        sides = CLUSTER_ROWS, CLUSTER_COLUMNS
         parts: dict[tuple[int, int], list[tuple[NDArray[np.intp], Image]]] = {}
         for group in groups:
             own = np.array([number[name] for name in group.names])
-            for down in range(0, group.images.shape[1], CLUSTER_ROWS):
-                for right in range(0, group.images.shape[2], CLUSTER_COLUMNS):
-                    part = group.images[
-                        :, down : down + CLUSTER_ROWS, right : right + CLUSTER_COLUMNS
-                    ]
-                    if part.any():
-                        place = group.row + down, group.column + right
-                        parts.setdefault(place, []).append((own, part.reshape(own.size, -1)))
+            lit = (group.images != 0).any(axis=0)
+            for axis, side in enumerate(sides):
+                lit = np.logical_or.reduceat(lit, np.arange(0, lit.shape[axis], side), axis)
+            for down, right in np.argwhere(lit) * sides:
+                part = group.images[:, down : down + CLUSTER_ROWS, right : right + CLUSTER_COLUMNS]
+                place = group.row + int(down), group.column + int(right)
+                parts.setdefault(place, []).append((own, part.reshape(own.size, -1)))
         normal, slope = np.zeros((len(names), len(names))), np.zeros(len(names))
-        clusters = []
+        clusters, root = [], np.sqrt(weights)
+        rest, error = root * rest, root * error
         for (row, column), found in parts.items():
             area = slice(row, row + CLUSTER_ROWS), slice(column, column + CLUSTER_COLUMNS)
             numbers, images = (np.concatenate(one) for one in zip(*found, strict=True))
-            weighted = images * weights[area].ravel()
-            information = weighted @ images.T
-            normal[np.ix_(numbers, numbers)] += information
-            slope[numbers] += weighted @ rest[area].ravel()
-            clusters.append(Cluster(numbers, information, weighted @ error[area].ravel()))
+            images *= root[area].ravel()
+            information = images @ images.T
+            normal[numbers[:, np.newaxis], numbers] += information
+            slope[numbers] += images @ rest[area].ravel()
+            clusters.append(Cluster(numbers, information, images @ error[area].ravel()))
         return cls(names, normal, slope, clusters)
 
     def estimate_covariances(self, inverse: FloatArray, known: FloatArray) -> FloatArray:
@@ -255,23 +256,28 @@ class NormalEquations:
         (R. Bell and D. McCaffrey, Surv. Methodol. 28, 169, 2002), here in each direction of what the
         cluster says of a surface.
         """
-        scores = np.zeros((len(self.clusters), self.slope.size))
-        for score, cluster in zip(scores, self.clusters, strict=True):
-            score[cluster.numbers] = cluster.score
-        influence, covariance = scores @ inverse, inverse @ known @ inverse
         ranges = "coefficients", "patterns"
         surfaces = np.array([number if name in ranges else -1 for name, number, _ in self.names])
-        for surface in np.unique(surfaces[surfaces >= 0]):
+        scores = np.zeros((len(self.clusters), self.slope.size))
+        informed: dict[
+            int, list[tuple[int, Pixels]]
+        ] = {}  # by which clusters, with which of their own
+        for number, cluster in enumerate(self.clusters):
+            scores[number, cluster.numbers] = cluster.score
+            owners = surfaces[cluster.numbers]
+            for surface in set(owners[owners >= 0].tolist()):
+                informed.setdefault(surface, []).append((number, np.flatnonzero(owners == surface)))
+        influence, covariance = scores @ inverse, inverse @ known @ inverse
+        for surface, found in informed.items():
             part = np.flatnonzero(surfaces == surface)
             factor, inverse_factor = _take_root(inverse[np.ix_(part, part)])
-            own = [surfaces[cluster.numbers] == surface for cluster in self.clusters]
-            says = np.flatnonzero([one.any() for one in own])
+            says = np.array([number for number, _ in found])
             said = np.zeros((says.size, part.size, part.size))
-            for information, one in zip(said, says, strict=True):
+            for information, (number, own) in zip(said, found, strict=True):
                 # a cluster may say nothing of some
-                place = np.searchsorted(part, self.clusters[one].numbers[own[one]])
-                whole = self.clusters[one].information
-                information[np.ix_(place, place)] = whole[np.ix_(own[one], own[one])]
+                place = np.searchsorted(part, self.clusters[number].numbers[own])
+                whole = self.clusters[number].information
+                information[np.ix_(place, place)] = whole[np.ix_(own, own)]
             leverage, axes = np.linalg.eigh(factor.T @ said @ factor)
             left = np.sqrt(1 - np.clip(leverage, 0, MAX_LEVERAGE))
             along = influence[np.ix_(says, part)] @ inverse_factor.T
@@ -507,14 +513,12 @@ def _eliminate_amplitude(
         changes[:, scale > 0] = start[:, scale > 0]
         iterations = FURTHER_ELIMINATION_ITERATIONS
     most = max(functions.shape[1] for functions, _ in shares)
-    for number, change in enumerate(changes[:most]):
-        image = np.zeros_like(model.image)
-        for group in own:
-            functions, _ = shares[group.names[0][1]]
-            if number < functions.shape[1]:
-                image[group.area] += np.tensordot(
-                    functions[:, number].astype(np.float32), group.images, 1
-                )
+    images = np.zeros((most, *model.image.shape), np.float32)
+    for group in own:
+        functions = shares[group.names[0][1]][0].astype(np.float32)
+        area = slice(functions.shape[1]), *group.area
+        images[area] += np.tensordot(functions.T, group.images, 1)
+    for number, (image, change) in enumerate(zip(images, changes, strict=False)):
         change[:] = explain_by_amplitude(model, image, change, scale, iterations)
         if start is None and number == 0:
             # a smooth multiple of a derivative takes nearly that multiple of its change
