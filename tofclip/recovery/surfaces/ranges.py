@@ -515,9 +515,9 @@ def _eliminate_amplitude(
     most = max(functions.shape[1] for functions, _ in shares)
     images = np.zeros((most, *model.image.shape), np.float32)
     for group in own:
-        functions = shares[group.names[0][1]][0].astype(np.float32)
+        functions, _ = shares[group.names[0][1]]
         area = slice(functions.shape[1]), *group.area
-        images[area] += np.tensordot(functions.T, group.images, 1)
+        images[area] += np.tensordot(functions.T.astype(np.float32), group.images, 1)
     for number, (image, change) in enumerate(zip(images, changes, strict=False)):
         change[:] = explain_by_amplitude(model, image, change, scale, iterations)
         if start is None and number == 0:
