@@ -304,6 +304,17 @@ def test_pye57_reads_e57_and_failed_files_are_closed(cloud, tmp_path):
     assert "scene.e57" in str(kept.value)
 
 
+def test_a_las_column_of_several_numbers_for_a_point_is_refused(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.add_extra_dim(laspy.ExtraBytesParams("tofclip_range", "2u2"))
+    table = laspy.LasData(header)
+    table.x = table.y = table.z = np.arange(3.0)
+    table.write(tmp_path / "pairs.las")
+    with pytest.raises(FileFormatError, match="'tofclip_range' has 2 numbers for a point"):
+        PointCloud.load(tmp_path / "pairs.las")
+
+
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_laspy_reads_micrometres_and_all_columns_with_their_units(cloud, tmp_path, suffix):
     laspy = pytest.importorskip("laspy")

@@ -348,7 +348,10 @@ def _list_las(path: Path) -> Entries:
         require_bounded_size(path, "LAS points", points * layout.size, path.stat().st_size, packed)
         for name in layout.extra_dimension_names:
             if name.startswith(DIMENSION_PREFIX):
-                types[name.removeprefix(DIMENSION_PREFIX)] = layout.dimension_by_name(name).dtype
+                kind = np.dtype(layout.dimension_by_name(name).dtype)
+                if kind.shape:
+                    raise FileFormatError(path, f"'{name}' has {kind.shape[0]} numbers for a point")
+                types[name.removeprefix(DIMENSION_PREFIX)] = kind
 
     def read() -> Mapping[str, Any]:
         with _open_las(path) as reader:
