@@ -38,7 +38,7 @@ HOMES = {
     "volume": ("nlos", "Volume"),
 }
 CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57")
-EXR_SIGNATURE, MATLAB_SIGNATURE, NPZ_SIGNATURE = b"\x76\x2f\x31\x01", b"MATLAB", b"PK\x03\x04"
+EXR_SIGNATURE, NPZ_SIGNATURE = b"\x76\x2f\x31\x01", b"PK\x03\x04"
 
 
 def load(path: str | Path) -> Any:
@@ -96,15 +96,14 @@ def _open(path: str | Path, values: bool) -> tuple[Record, Any]:
     head = import_module("devices.recording.read").read_head_if_recording(file)
     if head is not None:
         return head, None
-    if start.startswith((NPZ_SIGNATURE, MATLAB_SIGNATURE)) or (
+    if start.startswith((NPZ_SIGNATURE, b"MATLAB")) or (
         start == HDF5_SIGNATURE and not is_own_file(file)
     ):
         captures = import_module("nlos.io.format_detection")
-        arrays = captures.list_capture_arrays(file, start)
-        if arrays is not None and values:
-            return Record(""), captures.read_capture(file)
-        if arrays is not None:
-            return Record("capture", _outline_arrays(arrays), origin=str(file)), None
+        if arrays := captures.list_capture_arrays(file, start):
+            if values:
+                return Record(""), captures.read_capture(file)
+            return _describe_archive(arrays, "capture"), None
     if start == HDF5_SIGNATURE:
         return (Record.load if values else read_outline)(file), None
     if start.startswith(EXR_SIGNATURE):
@@ -118,35 +117,28 @@ def _open(path: str | Path, values: bool) -> tuple[Record, Any]:
         archive = Archive(file)
         is_cloud = is_cloud and not archive.names.isdisjoint(("x", "x_m"))  # else maybe a LIFT shot
         if not is_cloud and "range_m" in archive:
-            return _open_range_image(archive, values), None
+            return _describe_archive(archive, "range image", values, "y", "x", "return"), None
         if not is_cloud and archive.names.issuperset(("lf", "u", "v")):
             if values:
                 return Record(""), read_light_field(file)
-            return Record("light_field", _outline_arrays(archive), origin=str(file)), None
+            return _describe_archive(archive, "light_field"), None
     if values:
         return Record(""), PointCloud.load(file) if is_cloud else read_streak(file)
     return PointCloud.read_outline(file) if is_cloud else outline_streak_file(file), None
 
 
-def _open_range_image(archive: Archive, values: bool) -> Record:
-    """What `tofclip lidar photons` writes to .npz; the ends of the arrays' names are their units."""
+def _describe_archive(archive: Archive, kind: str, values: bool = False, *axes: str) -> Record:
+    """A file of named arrays; the ends of their names are their units. Without `values` single
+    numbers are read alone.
+    """
     fields = {}
     for name in sorted(archive.names):
         entry = archive.describe(name)
-        units = {"m": "m", "percent": "percent"}.get(name.rpartition("_")[2], "")
-        content = archive.read(name) if values else make_stand_in(entry.shape, entry.dtype)
-        fields[name] = Field(content, units, ("y", "x", "return")[: len(entry.shape)])
-    return Record("range image", fields, origin=str(archive.path))
-
-
-def _outline_arrays(archive: Archive) -> dict[str, Field]:
-    entries = {name: archive.describe(name) for name in sorted(archive.names)}
-    return {
-        name: Field(
-            make_stand_in(one.shape, one.dtype) if math.prod(one.shape) > 1 else archive.read(name)
-        )
-        for name, one in entries.items()
-    }
+        is_read = values or math.prod(entry.shape) == 1
+        content = archive.read(name) if is_read else make_stand_in(entry.shape, entry.dtype)
+        units = {"m": "m", "s": "s", "percent": "percent"}.get(name.rpartition("_")[2], "")
+        fields[name] = Field(content, units, axes[: len(entry.shape)])
+    return Record(kind, fields, origin=str(archive.path))
 
 
 def _open_depth_picture(file: Path) -> Record:
