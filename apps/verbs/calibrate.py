@@ -420,7 +420,8 @@ def _list_design_figures(found: DesignReport) -> dict[str, Any]:
 
 def _write_shots(known: Design, name: str, shots: int, seed: int, out: Path) -> list[Path]:
     """Write shots, camera and true frames into a folder."""
-    from tofclip.designs import make_scene, take_shots
+    from tofclip.design_description import make_scene
+    from tofclip.designs import take_shots
     from tofclip.simulate import render_true_frames
 
     if shots < 1:
