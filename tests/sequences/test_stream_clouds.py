@@ -217,11 +217,11 @@ def test_light_that_is_clipped_in_a_later_shot_alone_changes_nothing(streaks):
     )
     both = np.isfinite(whole) & np.isfinite(range_)
     assert both.sum() >= np.isfinite(whole).sum() - 1 > 100  # one is at the limit
-    # A tenth of a bin of 50 ps, and 1.2 mm at a surface's rim, of which more is kept by evidence than by
+    # A tenth of a bin of 50 ps, and 1.3 mm at a surface's rim, of which more is kept by evidence than by
     # brightness: 0.14 of its light; taken for measurements, clipped light lacks up to a half.
     off = np.abs(range_[both] - whole[both])
     assert np.quantile(off, 0.95) < 7e-4
-    assert off.max() < 1.3e-3
+    assert off.max() < 1.5e-3
     less = np.abs(clipped_light[both] / light[both] - 1)
     assert np.quantile(less, 0.95) < 0.16
     assert less.max() < 0.25

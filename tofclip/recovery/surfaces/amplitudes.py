@@ -39,15 +39,15 @@ class AmplitudeSolver:
     Different surfaces hardly share measurements, so that a step for each is as safe as one for all and
     does not hold the bright ones back.
 
-    `weight`: of total variation, in standard deviations of the noise in the misfit's gradient;
-    `earlier`: of the same surfaces, seen by another shot: what it found saves work.
+    `weight`: of total variation, in standard deviations of the noise in the misfit's gradient, one or one
+    for each surface; `earlier`: of the same surfaces, seen by another shot: what it found saves work.
     """
 
     def __init__(
         self,
         model: SurfaceModel,
         amplitude: Image,
-        weight: float,
+        weight: float | FloatArray,
         earlier: AmplitudeSolver | None = None,
     ) -> None:
         self.model, self.amplitude, self.weight = model, amplitude, weight
@@ -93,6 +93,18 @@ class AmplitudeSolver:
         found = self.map_pictures(pool_information, information, self.amplitude)
         # running sums may leave a rounding error below nothing
         return np.asarray(self.amplitude * np.sqrt(np.maximum(found, 0)))
+
+    def measure_light(self) -> FloatArray:
+        """By how many deviations of a pixel's noise the light of each surface stands out of it, on average
+        over the light, (surfaces,).
+        """
+        model, amplitude = self.model, self.amplitude
+        information = np.maximum(self.variance * model.gather(model.weights, squared=True), 0)
+        light, out = (
+            np.bincount(model.surface, one, len(model.parts))
+            for one in (amplitude, amplitude**2 * np.sqrt(information))
+        )
+        return np.asarray(out / np.maximum(light, TINY))
 
     def map_pictures(
         self, work: Callable[..., NDArray[Any]], *values: NDArray[Any]

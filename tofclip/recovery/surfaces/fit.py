@@ -66,8 +66,8 @@ LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 3.5, 0.05, 3
 
 # Logarithm of the odds that a return of the frames beside the surfaces is false: nothing known, for each
 # deviation out of the noise that the whole shot shows, where there are few, and for each e-fold of the
-# odds that the frames alone give it. From scenes of known returns.
-OTHER_ODDS, ENOUGH_SIGMAS, LEAST_DOUBT = np.array([5.7, -0.56, 1.96]), 15.0, 1e-4
+# odds that the frames alone give it. From scenes of known returns, of those that the shot shows at all.
+OTHER_ODDS, ENOUGH_SIGMAS, LEAST_DOUBT = np.array([4.64, -0.77, 1.06]), 15.0, 1e-4
 # About such a return its range may have light as well: what is too dim to be a surface is seen at a few
 # of its pixels, which would have the light of all.
 ABOUT_OTHERS_PX = 1
@@ -145,7 +145,7 @@ def _fit_returns(
     solver, begun = straighten_surfaces(solver)
     refinement, remainder = _refine(solver, begun, tick)
     # dim light has given way a little by now
-    sparse = _explain_sparsely(solver.model, solver, SPARSELY)
+    sparse = _explain_sparsely(solver.model, solver, weight, SPARSELY)
     solver.run(iterations, tick)
     reference = solver.model.unexplained(solver.amplitude)
     beside = _find_others(solver, found, tick)
@@ -201,7 +201,8 @@ def follow_surfaces(
     # what explains the last shot best without the prior has that shot's noise
     refinement = refine_state(model, solver.amplitude, begun, True)
     solver.amplitude = refinement.amplitude
-    sparse = _explain_sparsely(model, solver if changed else fit.sparse, FOLLOWING_SPARSELY)
+    before = solver if changed else fit.sparse
+    sparse = _explain_sparsely(model, before, weight, FOLLOWING_SPARSELY)
     solver.run(FOLLOWING_ITERATIONS)
     unexplained = model.unexplained(solver.amplitude)
     if unexplained > limit:
@@ -212,13 +213,20 @@ def follow_surfaces(
 
 
 def _explain_sparsely(
-    model: SurfaceModel, begun: AmplitudeSolver, schedule: Sequence[tuple[float, int]]
+    model: SurfaceModel,
+    begun: AmplitudeSolver,
+    weight: float,
+    schedule: Sequence[tuple[float, int]],
 ) -> AmplitudeSolver:
     """Explain a shot with dim light beside bright only where it needs it, from amplitudes of the same
     surfaces; `schedule`: what such light costs, and for how many iterations at most.
+
+    A line that is half as wide is twice as bright, and total variation would keep it wide: it counts
+    the less, the further a surface's light is out of a pixel's noise by itself.
     """
-    sparse = AmplitudeSolver(model, begun.amplitude, begun.weight, begun)
+    sparse = AmplitudeSolver(model, begun.amplitude, weight, begun)
     for sigmas, most in schedule:
+        sparse.weight = weight / (1 + sparse.measure_light())
         sparse.run(most, against_dim=sigmas)
     return sparse
 
@@ -331,11 +339,12 @@ def _find_others(
     doubt = np.clip(np.nan_to_num(others.false_alarm, nan=SURE_FALSE_ALARM), LEAST_DOUBT, 0.5)
     known = [np.ones(shown.size), shown, scipy.special.logit(doubt)]
     doubt = scipy.special.expit(OTHER_ODDS @ np.array(known)).astype(np.float32)
+    doubt[shown < 1] = 1
     others = replace(others, false_alarm=doubt)
     # Drawn is what is expected of each where it may be false, or noise (W. James and C. Stein, Proc. 4th
     # Berkeley Symp. 1, 361, 1961). The light of those that are not drawn, or dropped as all methods drop
     # them, goes to the others; and what lies about them is not theirs alone.
-    drawn = (doubt <= DEFAULT_FALSE_ALARM) & (shown > 1)
+    drawn = doubt <= DEFAULT_FALSE_ALARM
     light = together.amplitude[own[drawn]]
     whole, own = _add_returns(solver, others[drawn], light, ABOUT_OTHERS_PX, tick)
     whole.amplitude[own] *= (1 - doubt[drawn]) * (1 - 1 / shown[drawn] ** 2)

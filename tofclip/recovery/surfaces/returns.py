@@ -14,10 +14,8 @@ from tofclip.camera import Camera
 from tofclip.lidar import Detection
 from tofclip.lidar.range_calibration import correct_returns
 from tofclip.lidar.search import number_returns
-from tofclip.recovery.surfaces.amplitudes import NEIGHBOURHOOD_PX, share_misfit
 from tofclip.recovery.surfaces.fit import (
     NEAR_BINS,
-    SURE_SIGMAS,
     SurfaceFit,
     find_candidates,
     find_near,
@@ -31,14 +29,15 @@ from tofclip.shots import Returns
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
 
-# Logarithm of the odds that a surface's point is false: nothing known, for each e-fold over 20 of the
-# deviations by which the shot needs it, where the frames have returns beside all points about it, for
-# each e-fold of the part of its surface's light that may as well lie elsewhere, for each by which its
-# place is as bright as the brightest beside it, and where something lies before it. From scenes of
-# known returns (tests/lidar/physics_scenes.py, apps/studies/surfaces.py); docs tell what they miss.
-FALSE_ODDS = np.array([5.6, -0.46, -4.29, 2.05, -0.80, 0.79])
+# Logarithm of the odds that a surface's point is false: nothing known, for each e-fold of the deviations
+# by which it is out of the noise, where the frames have returns beside all points about it, for each
+# e-fold of the part of its surface's light that may as well lie elsewhere, and for each by which its
+# place is then as bright as the brightest beside it, times that part, and where something lies before
+# it. From scenes of known returns (tests/lidar/physics_scenes.py, apps/studies/surfaces.py); docs tell
+# what they miss.
+FALSE_ODDS = np.array([4.7, -0.93, -4.13, 1.20, -7.69, 0.74])
 # Less, and of light elsewhere more, makes no difference.
-LEAST_SIGMAS, LEAST_ELSEWHERE, MOST_ELSEWHERE, LEAST_BRIGHT = 0.1, 0.02, 0.2, 0.01
+LEAST_ELSEWHERE, MOST_ELSEWHERE, LEAST_BRIGHT = 0.02, 0.5, 0.01
 ABOUT_PX = 5  # side of the square
 
 # Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
@@ -133,28 +132,21 @@ def _judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
 
 def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
     """Numbers of the candidates among the points, and what `FALSE_ODDS` weighs of each, (5, candidates)."""
-    solver, sparse, model, seen = fit.solver, fit.sparse, fit.solver.model, fit.seen
-    variance = solver.estimate_local_variance()
-    shown = find_candidates(solver, solver.measure_significance(variance), limit)
-    light, sparsely = (model.render(one.amplitude) for one in (solver, sparse))
-    change = (model.image - sparsely) ** 2 - (model.image - light) ** 2
-    worse = share_misfit(model, solver.amplitude, light, model.weights / variance * change)
-    place = partial(scipy.ndimage.uniform_filter, size=NEIGHBOURHOOD_PX, mode="constant")
-    worse = np.maximum(NEIGHBOURHOOD_PX**2 * solver.map_pictures(place, worse), 0)
-    # Where dim light is costly, a point is needed by the light that stays there, on whichever surface, and
-    # by how much worse the shot is explained without what does not.
-    stays, all_near = _add_up_near(model, np.array([sparse.amplitude, solver.amplitude]))
-    sparse = copy.copy(sparse)
-    sparse.amplitude = (stays / np.maximum(all_near, TINY) * solver.amplitude).astype(np.float32)
-    needed = np.sqrt(sparse.measure_significance(variance) ** 2 + worse)
+    solver, model, seen = fit.solver, fit.solver.model, fit.seen
+    significance = solver.measure_significance()
+    shown = find_candidates(solver, significance, limit)
     # Light of a line of one range may lie anywhere in a lens about it: of such a surface the two
-    # explanations are unlike where they are as probable.
-    moved = np.maximum(solver.amplitude - sparse.amplitude, 0) * np.exp(-worse / 2)
+    # explanations are unlike. Light that stays near on another surface counts as the point's own.
+    sparse = copy.copy(fit.sparse)
+    stays, near = _add_up_near(model, np.array([sparse.amplitude, solver.amplitude]))
+    sparse.amplitude = (stays / np.maximum(near, TINY) * solver.amplitude).astype(np.float32)
+    bright, brightest = sparse.compare_places()
+    moved = np.maximum(solver.compare_places()[0] - bright, 0)
     lost, whole = (
         np.bincount(model.surface, one, len(model.parts)) for one in (moved, solver.amplitude)
     )
     elsewhere = np.clip(lost / np.maximum(whole, TINY), LEAST_ELSEWHERE, MOST_ELSEWHERE)
-    bright, brightest = sparse.compare_places()
+    elsewhere = elsewhere[model.surface[shown]]
 
     points = model.row[shown], model.column[shown], model.distance[shown]
     candidates, confirmed = shown.astype(np.float64), np.zeros(shown.size)
@@ -165,10 +157,10 @@ def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]
     np.minimum.at(nearest, pixel, model.distance[shown])
     behind = model.distance[shown] > nearest[pixel] + NEAR_BINS * model.row_m
     known = [
-        np.log(np.maximum(needed[shown], LEAST_SIGMAS) / SURE_SIGMAS),
+        np.log(significance[shown]),
         about / near,
-        np.log(elsewhere)[model.surface[shown]],
-        np.log(np.maximum(bright / np.maximum(brightest, TINY), LEAST_BRIGHT))[shown],
+        np.log(elsewhere),
+        elsewhere * np.log(np.maximum(bright / np.maximum(brightest, TINY), LEAST_BRIGHT))[shown],
         behind,
     ]
     return np.flatnonzero(shown), np.array(known)
