@@ -319,7 +319,7 @@ class SurfaceModel:
         # rows before and behind the streak image whose light reaches it later or earlier
         self.before = int(max(self.pulse.lags.max(), 0))
         self._rows = self.before + self.image.shape[0] + int(max(-self.pulse.lags.min(), 0))
-        where = self._find_directions()
+        where = self._find_parts()
         spread = self.share_out(
             lambda views: [self._spread_view(view, *where) for view in views], self.camera.views
         )
@@ -352,19 +352,21 @@ class SurfaceModel:
         ]
         return np.where(np.array(found) < 0, own, found)
 
-    def _find_directions(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Where parts of points are in the picture, (places,) from the optical axis, px, to the right and
-        down, and in which directions, (places, 3).
+    def _find_parts(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Where parts of points are, (places,) each: from the optical axis of the picture, px, to the right
+        and down; from that of the lens, m, to the right; and by how much views see them sheared.
         """
         axis_row, axis_column = self.camera.optical_axis_px
         x, y = (
             one[self.places.point] + off
             for one, off in zip((self._x, self._y), self.places.offset, strict=True)
         )
-        return x, y, compute_ray_directions(self.camera, y + axis_row, x + axis_column)
+        ways = compute_ray_directions(self.camera, y + axis_row, x + axis_column)
+        right, _, depth = self.places.distance * ways.T
+        return x, y, right, self.camera.shear_at(depth)
 
     def _spread_view(
-        self, view: int, x: FloatArray, y: FloatArray, directions: FloatArray
+        self, view: int, x: FloatArray, y: FloatArray, right: FloatArray, shear: FloatArray
     ) -> Footprint:
         """Return which rows and columns of a view the light of points reaches. Nothing of what
         misses the streak image is kept: a surface may run off without end, and one that comes close
@@ -373,7 +375,7 @@ class SurfaceModel:
         from tofclip.recovery.surfaces import kernels
 
         rows, margin, samples = self._rows, self._margin, kernels.SPLINE_SAMPLES
-        row, column, between, pace = self._locate(view, x, y, directions)
+        row, column, between, pace = self._locate(view, x, y, right, shear)
         first_parts = self.places.starts[:-1]
         between = BetweenCentres(between.before[first_parts], between.fraction[first_parts])
         height = self.measure_height(row[first_parts])
@@ -406,22 +408,20 @@ class SurfaceModel:
         return Footprint(*light, lines - top, reached_rows, between, height, pace)
 
     def _locate(
-        self, view: int, x: FloatArray, y: FloatArray, directions: FloatArray
+        self, view: int, x: FloatArray, y: FloatArray, right: FloatArray, shear: FloatArray
     ) -> tuple[FloatArray, FloatArray, BetweenCentres, float]:
         """Where parts of points fall in a view, (places,): row and column of the raw streak image,
         between which centres, and how many raw rows the time of one takes.
         """
         camera, position = self.camera, self.camera.view_positions[view]
-        distance = self.places.distance
-        points = directions * distance[:, np.newaxis]
-        viewpoint = np.array([camera.lenslet_pitch * position, 0.0, 0.0])
-        back = np.linalg.norm(points - viewpoint, axis=1)
+        distance, aside = self.places.distance, camera.lenslet_pitch * position
+        back = np.sqrt(distance**2 + aside * (aside - 2 * right))
         column = (
             camera.centres_px[view]
             + self.state.centres[view]
             + x
             - y * np.tan(camera.angles[view])
-            + camera.shear_at(points[:, 2]) * position
+            + shear * position
         )
         between = BetweenCentres.find(camera.centres_px, column)
         time = (distance + back) / SPEED_OF_LIGHT + camera.time_zero

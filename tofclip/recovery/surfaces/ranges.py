@@ -517,7 +517,7 @@ def _eliminate_amplitude(
     for group in own:
         functions, _ = shares[group.names[0][1]]
         area = slice(functions.shape[1]), *group.area
-        images[area] += np.tensordot(functions.T.astype(np.float32), group.images, 1)
+        images[area] += _combine(functions, group.images)
     for number, (image, change) in enumerate(zip(images, changes, strict=False)):
         change[:] = explain_by_amplitude(model, image, change, scale, iterations)
         if start is None and number == 0:
@@ -543,9 +543,17 @@ def _eliminate_amplitude(
     for group, seen in zip(own, itertools.chain.from_iterable(explained), strict=True):
         surface = group.names[0][1]
         _, quadratic = shares[surface]
-        group.images[...] -= np.tensordot(quadratic.T.astype(np.float32), seen.images, 1)
+        group.images[...] -= _combine(quadratic, seen.images)
         patterns.append(seen._replace(names=[("patterns", *name[1:]) for name in seen.names]))
     return changes, patterns
+
+
+def _combine(shares: FloatArray, images: Image) -> Image:
+    """Sums of images, (n, rows, columns), by shares, (n, sums); those of quadratics and quadrics are the
+    images themselves.
+    """
+    few, many = shares.shape
+    return images if few == many else np.tensordot(shares.T.astype(np.float32), images, 1)
 
 
 def compute_objective(model: SurfaceModel, rest: Image) -> float:
@@ -602,17 +610,16 @@ def _move(
 ) -> Image:
     """Place the model where a step leads from a state; return the amplitudes that go along."""
     moved, ahead = state.copy(), amplitude.copy()
+    steps: dict[tuple[str, int], list[float]] = {}
     for (name, surface, number), value in zip(names, change, strict=True):
+        steps.setdefault((name, surface), []).append(value)
         if name not in ("coefficients", "patterns"):
             values = getattr(moved, name)
             values = values[surface] if name == "shading" else values
             # gains and widths change relatively
             values[number] += value * (values[number] if name in ("gains", "widths") else 1.0)
     for surface, (part, basis) in enumerate(zip(model.parts, model.bases, strict=True)):
-        own, explained = (
-            change[[i for i, unknown in enumerate(names) if unknown[:2] == (name, surface)]]
-            for name in ("coefficients", "patterns")
-        )
+        own, explained = (np.array(steps[name, surface]) for name in ("coefficients", "patterns"))
         moved.coefficients[surface] = basis.take_step(
             model.functions[surface], state.coefficients[surface], own, amplitude[part]
         )
