@@ -119,7 +119,7 @@ def test_few_photons_show_letters():
 @pytest.mark.parametrize(("photons", "least"), [(1147, 0.63), (5.7, 0.5), (1.15, 0.2)])
 def test_points_at_all_levels(wall, photons, least):
     near = mask_of("points", FINE)
-    for seed in range(5):
+    for seed in range(2):
         capture = count(wall, "points", photons, 64, seed)
         refined = PhotonRefinement(LINEAR).reconstruct(capture, FINE)
         assert energy_fraction(refined.values, near) >= least
