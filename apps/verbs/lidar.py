@@ -176,6 +176,10 @@ def parallax(
         from tofclip.recovery import count_parallax_work, fit_parallax_to_shot, open_shot
 
         shot = open_shot(streak, camera, time_zero)
+    if time_zero is None and not shot.camera.time_zero:
+        raise InputError(
+            "shears follow from true ranges, and no time zero is known: give --time-zero-ns"
+        )
     with show_progress("focusing", count_parallax_work(shot, shears)) as advance:
         found = fit_parallax_to_shot(shot, gates, shears, advance)
     found.camera.save(out)
