@@ -283,7 +283,9 @@ def _bend_where_needed(patch: Patch, bin_m: float) -> Patch:
         inverse = patch.ray_length.ravel()[patch.pixels] / patch.distance
         basis, coefficients = fit_quadric(patch.pixels, inverse, patch.basis.image_shape)
         quadric = replace(patch, basis=basis, coefficients=coefficients)
-        bent = min(quadric, bent, key=Patch.compute_error)
+        # free as splines are, they follow a ball's returns better than the ball, where these are displaced
+        if quadric.compute_error() < max(CREASE_BINS * bin_m, bent.compute_error()):
+            bent = quadric
     return bent if bent.compute_error() < BENT_FRACTION * plain else patch
 
 
