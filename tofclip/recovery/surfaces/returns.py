@@ -35,9 +35,9 @@ from tofclip.units import SPEED_OF_LIGHT
 # place is then as bright as the brightest beside it, times that part, and where something lies before
 # it. From scenes of known returns (tests/lidar/physics_scenes.py, apps/studies/surfaces.py); docs tell
 # what they miss.
-FALSE_ODDS = np.array([4.7, -0.93, -4.13, 1.20, -7.69, 0.74])
+FALSE_ODDS = np.array([6.44, -1.10, -3.82, 2.03, -7.79, 0.79])
 # Less, and of light elsewhere more, makes no difference.
-LEAST_ELSEWHERE, MOST_ELSEWHERE, LEAST_BRIGHT = 0.02, 0.5, 0.01
+LEAST_ELSEWHERE, MOST_ELSEWHERE, LEAST_BRIGHT = 0.07, 0.5, 0.01
 ABOUT_PX = 5  # side of the square
 
 # Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
@@ -156,11 +156,12 @@ def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]
     nearest, pixel = np.full(model.masks[0].size, np.inf), model.pixel[shown]
     np.minimum.at(nearest, pixel, model.distance[shown])
     behind = model.distance[shown] > nearest[pixel] + NEAR_BINS * model.row_m
+    dim = np.log(np.maximum(bright / np.maximum(brightest, TINY), LEAST_BRIGHT))[shown]
     known = [
         np.log(significance[shown]),
         about / near,
         np.log(elsewhere),
-        elsewhere * np.log(np.maximum(bright / np.maximum(brightest, TINY), LEAST_BRIGHT))[shown],
+        elsewhere * dim,
         behind,
     ]
     return np.flatnonzero(shown), np.array(known)
