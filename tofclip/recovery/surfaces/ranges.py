@@ -503,8 +503,7 @@ def _eliminate_amplitude(
     surface, number). Things of one range, as head and arms, do share measurements: of one of them
     alone amplitudes, its own and the others', explain more than of all together. What they explain is
     an unknown of its own; taken for what only late views explain, it would make steps too short and
-    ranges surer than they are. Of quadratics it is the first alone: with all, light stayed where a wire
-    is not, in the lens about it (`AmplitudeSolver.run`).
+    ranges surer than they are.
     """
     own = [group for group in groups if group.names[0][0] == "coefficients"]
     shares = [basis.quadratic_parts for basis in model.bases]
@@ -545,10 +544,7 @@ def _eliminate_amplitude(
         surface = group.names[0][1]
         _, quadratic = shares[surface]
         group.images[...] -= _combine(quadratic, seen.images)
-        apart = [("patterns", *name[1:]) for name in seen.names]
-        if model.bases[surface].is_quadratic:
-            apart = apart[:1]
-        patterns.append(seen._replace(names=apart, images=seen.images[: len(apart)].copy()))
+        patterns.append(seen._replace(names=[("patterns", *name[1:]) for name in seen.names]))
     return changes, patterns
 
 
@@ -627,8 +623,7 @@ def _move(
         moved.coefficients[surface] = basis.take_step(
             model.functions[surface], state.coefficients[surface], own, amplitude[part]
         )
-        along = -basis.quadratic_parts[1] @ own
-        along[: explained.size] += explained
+        along = explained - basis.quadratic_parts[1] @ own
         ahead[part] += along.astype(np.float32) @ changes[: along.size, part]
     # the mean gain is the amplitudes' unit, and so is the mean brightness behind a surface
     brighter, shading = moved.gains.mean() / state.gains.mean(), moved.shading.mean(axis=1)
