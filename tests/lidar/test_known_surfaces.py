@@ -15,8 +15,12 @@ from tofclip.errors import InputError
 
 def recover(scene, photons):
     shot = make_shot(scene, seed=2, photons=photons, size=64)
+    return recover_shot(shot, shot.true_camera)
+
+
+def recover_shot(shot, camera):
     streak = tofclip.Streak(shot.counts, shot.row_times)
-    frames = tofclip.recover(streak, shot.true_camera, "surfaces")
+    frames = tofclip.recover(streak, camera, "surfaces")
     cloud = tofclip.point_cloud(tofclip.depth(frames))
     place = shot.locate(cloud.xyz)
     return frames, shot.score(*place, cloud.range, cloud.range_sigma, cloud.false_alarm)
@@ -89,6 +93,18 @@ def test_a_person_is_round():
     assert score["medians_mm"]["head"] < 0.8
     assert score["medians_mm"]["torso"] < 0.5
     assert score["medians_mm"]["limb"] < 0.5
+
+
+@pytest.mark.nightly
+def test_a_table_is_one_surface_whatever_stands_on_it():
+    """Frames' returns are bent about a melon and below a book: of three surfaces in one place, 0.024 was
+    missed and 0.021 false; here 0.002 and 0.
+    """
+    shot = make_shot("table", seed=28, size=64)
+    _, score = recover_shot(shot, shot.camera)
+    assert score["miss"] < 0.008
+    assert score["false"] < 0.005
+    assert score["medians_mm"]["table top"] < 0.6
 
 
 @pytest.mark.nightly

@@ -22,7 +22,7 @@ from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, Tick, share_mi
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.patches import find_dimmer_patches, rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
-from tofclip.recovery.surfaces.ranges import Refinement, refine_state
+from tofclip.recovery.surfaces.ranges import Refinement, compute_objective, refine_state
 from tofclip.recovery.surfaces.shapes import COEFFICIENTS, ROUND_COEFFICIENTS, Pixels
 from tofclip.recovery.surfaces.start import (
     CHANGED_RATIO,
@@ -55,6 +55,8 @@ CHANGED_EXCESS = 0.02  # beyond `CHANGED_RATIO` of what surfaces left unexplaine
 # Of the greatest need to be bent of all surfaces, or of a need that leaves no doubt: those that need it
 # more are bent.
 CERTAINLY_BENT, NO_DOUBT = 3.0, 100.0
+
+DOUBLE_FRACTION = 0.2  # of a surface's lit points: that many beside another's may be the other's
 
 # Bins in range, and pixels, within which frames' returns and surfaces are the same.
 NEAR_BINS, NEAR_PX = 7.0, 1.5
@@ -138,6 +140,7 @@ def _fit_returns(
         _, whole = _find_others(solver, found, tick)
         require_explained(whole, limit, frames, streak)
     solver = _keep_lit(solver)
+    solver = join_surfaces(solver)
     solver.model.find_behind(solver.amplitude)
 
     # 5. Ranges, after splines that are not needed: these take longer to be right, and late views give
@@ -246,6 +249,68 @@ def _keep_lit(solver: AmplitudeSolver) -> AmplitudeSolver:
     return solver.cover(kept) if kept.any() else solver
 
 
+def join_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
+    """Make one of two surfaces that are both lit in the same pixels within a pulse of each other, if that
+    explains the shot better after a step: returns of frames are bent about what stands on a table, and
+    surfaces that follow these take the table's light for theirs.
+    """
+    doubles = _list_doubles(solver)
+    before = _look_ahead(solver) if doubles else 0.0
+    while doubles:
+        large, small = doubles.pop(0)
+        # where both are far off, the larger alone is the better guess
+        trials = [_join(solver, large, small, like) for like in ([large, small], [large])]
+        for trial in trials:
+            trial.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        left = [_look_ahead(trial) for trial in trials]
+        if min(left) < before:
+            before, solver = min(left), trials[int(np.argmin(left))]
+            doubles = _list_doubles(solver)
+    return solver
+
+
+def _list_doubles(solver: AmplitudeSolver) -> list[tuple[int, int]]:
+    """Pairs of surfaces of which the smaller is, in a part of its pixels, where the larger is; the larger
+    one first.
+    """
+    model = solver.model
+    lit = np.flatnonzero(solver.measure_significance() > LIT_SIGMAS)
+    order, rank = rank_within_pixels(model.pixel[lit], model.distance[lit])
+    nearer, farther = lit[order[:-1]], lit[order[1:]]
+    near = (rank[1:] > 0) & (
+        model.distance[farther] - model.distance[nearer] < NEAR_BINS * model.row_m
+    )
+    size = np.bincount(model.surface[lit], minlength=len(model.parts))
+    shared = np.zeros((size.size, size.size))
+    np.add.at(shared, (model.surface[nearer[near]], model.surface[farther[near]]), 1)
+    shared = np.triu(shared + shared.T, 1)
+    pairs = np.argwhere(shared > DOUBLE_FRACTION * np.minimum.outer(size, size))
+    pairs = pairs[np.argsort(-shared[tuple(pairs.T)])]
+    return [(int(a), int(b)) if size[a] >= size[b] else (int(b), int(a)) for a, b in pairs]
+
+
+def _join(solver: AmplitudeSolver, large: int, small: int, like: list[int]) -> AmplitudeSolver:
+    """Give the light and the pixels of one surface to another, as the quadratic nearest to some."""
+    model = solver.model
+    points = np.flatnonzero(np.isin(model.surface, like))
+    nearest = model.find_quadratic(points, solver.amplitude)
+    masks, pictures = model.masks.copy(), np.zeros(model.masks.shape, np.float32)
+    pictures[masks] = solver.amplitude
+    masks[large] |= masks[small]
+    pictures[large] += pictures[small]
+    masks[small] = False
+    joined = solver.cover(masks)
+    joined.amplitude = pictures[masks]
+    joined.model = joined.model.straighten({large - (small < large): nearest})
+    return joined
+
+
+def _look_ahead(solver: AmplitudeSolver) -> float:
+    """The objective after a step on ranges."""
+    ahead = copy.copy(solver.model)
+    return compute_objective(ahead, refine_state(ahead, solver.amplitude).rest)
+
+
 def straighten_surfaces(
     solver: AmplitudeSolver,
 ) -> tuple[AmplitudeSolver, Refinement | None]:
@@ -265,7 +330,10 @@ def straighten_surfaces(
     before, straight = refine_state(ahead, solver.amplitude), bent
     light = model.render(solver.amplitude)
     while straight:
-        trial = model.straighten(straight, solver.amplitude)
+        own = ((one, np.flatnonzero(model.surface == one)) for one in straight)
+        trial = model.straighten(
+            {one: model.find_quadratic(points, solver.amplitude) for one, points in own}
+        )
         # what amplitudes explain hardly depends on the basis: begun there, but still a first step
         after = refine_state(trial, solver.amplitude, replace(before, steps=0))
         change = model.weights * (after.rest**2 - before.rest**2)

@@ -38,7 +38,7 @@ from tofclip.recovery.surfaces.pulse import (
     ShotPulse,
     make_pulse,
 )
-from tofclip.recovery.surfaces.shapes import KnownBasis, SmoothBasis
+from tofclip.recovery.surfaces.shapes import KnownBasis, SmoothBasis, evaluate_monomials
 from tofclip.shots import Streak
 from tofclip.threads import map_parallel, split_blocks, thread_count
 from tofclip.units import SPEED_OF_LIGHT
@@ -475,20 +475,24 @@ class SurfaceModel:
         """What is left of the signal, as a fraction."""
         return compare_smoothed(self.render(amplitude), self.image, self.weights > 0)
 
-    def straighten(self, surfaces: Sequence[int], amplitude: Image) -> SurfaceModel:
-        """Return the same surfaces, some of splines replaced by the quadratics that are nearest to them
-        where they are lit.
+    def find_quadratic(self, points: NDArray[np.intp], amplitude: Image) -> FloatArray:
+        """Return the coefficients, (6,), of the quadratic that is nearest to some points, the more the
+        brighter they are.
         """
+        light = np.sqrt(amplitude[points].astype(np.float64))
+        design = evaluate_monomials(self.pixel[points], self.masks.shape[1:])
+        inverse = light * self.ray_length[points] / self.distance[points]
+        nearest, *_ = np.linalg.lstsq(light[:, np.newaxis] * design, inverse)
+        return nearest.astype(np.float64)
+
+    def straighten(self, quadratics: dict[int, FloatArray]) -> SurfaceModel:
+        """Return the same surfaces, some of them quadratics of such coefficients, (6,) each."""
         other, state = copy.copy(self), self.state.copy()
         other.bases, other.functions = list(self.bases), list(self.functions)
-        for surface in surfaces:
-            part = self.parts[surface]
+        for surface, coefficients in quadratics.items():
             basis = SmoothBasis(self.bases[surface].image_shape)
-            design, lit = basis.evaluate(self.pixel[part]), amplitude[part] > 0
-            inverse = self.ray_length[part] / self.distance[part]
-            nearest, *_ = np.linalg.lstsq(design[lit], inverse[lit])
-            state.coefficients[surface] = nearest.astype(np.float64)
-            other.bases[surface], other.functions[surface] = basis, design
+            state.coefficients[surface], other.bases[surface] = coefficients, basis
+            other.functions[surface] = basis.evaluate(self.pixel[self.parts[surface]])
         other.place(state)
         return other
 
