@@ -14,6 +14,7 @@ from tofclip.camera import Camera
 from tofclip.lidar import Detection
 from tofclip.lidar.range_calibration import correct_returns
 from tofclip.lidar.search import number_returns
+from tofclip.recovery.surfaces.amplitudes import NEIGHBOURHOOD_PX, share_misfit
 from tofclip.recovery.surfaces.fit import (
     NEAR_BINS,
     SurfaceFit,
@@ -136,12 +137,20 @@ def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]
     significance = solver.measure_significance()
     shown = find_candidates(solver, significance, limit)
     # Light of a line of one range may lie anywhere in a lens about it: of such a surface the two
-    # explanations are unlike. Light that stays near on another surface counts as the point's own.
+    # explanations are unlike where they are as probable: a recorded shot, which neither explains to the
+    # noise, lost a third of its points otherwise. Light that stays near on another surface counts as the
+    # point's own.
     sparse = copy.copy(fit.sparse)
     stays, near = _add_up_near(model, np.array([sparse.amplitude, solver.amplitude]))
     sparse.amplitude = (stays / np.maximum(near, TINY) * solver.amplitude).astype(np.float32)
     bright, brightest = sparse.compare_places()
+    light, sparsely = (model.render(one.amplitude) for one in (solver, fit.sparse))
+    change = (model.image - sparsely) ** 2 - (model.image - light) ** 2
+    change *= model.weights / solver.estimate_local_variance()
+    place = partial(scipy.ndimage.uniform_filter, size=NEIGHBOURHOOD_PX, mode="constant")
+    worse = solver.map_pictures(place, share_misfit(model, solver.amplitude, light, change))
     moved = np.maximum(solver.compare_places()[0] - bright, 0)
+    moved *= np.exp(-(NEIGHBOURHOOD_PX**2) * np.maximum(worse, 0) / 2)
     lost, whole = (
         np.bincount(model.surface, one, len(model.parts)) for one in (moved, solver.amplitude)
     )
