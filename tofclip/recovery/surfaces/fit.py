@@ -22,7 +22,7 @@ from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, Tick, share_mi
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.patches import find_dimmer_patches, rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
-from tofclip.recovery.surfaces.ranges import Refinement, compute_objective, refine_state
+from tofclip.recovery.surfaces.ranges import Refinement, refine_state
 from tofclip.recovery.surfaces.shapes import COEFFICIENTS, ROUND_COEFFICIENTS, Pixels
 from tofclip.recovery.surfaces.start import (
     CHANGED_RATIO,
@@ -251,21 +251,21 @@ def _keep_lit(solver: AmplitudeSolver) -> AmplitudeSolver:
 
 def join_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
     """Make one of two surfaces that are both lit in the same pixels within a pulse of each other, if that
-    explains the shot better after a step: returns of frames are bent about what stands on a table, and
-    surfaces that follow these take the table's light for theirs.
+    explains the shot better: returns of frames are bent about what stands on a table, and surfaces that
+    follow these take the table's light for theirs.
     """
     doubles = _list_doubles(solver)
-    before = _look_ahead(solver) if doubles else 0.0
+    if doubles:
+        solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
     while doubles:
         large, small = doubles.pop(0)
-        # where both are far off, the larger alone is the better guess
+        # where the smaller is far off, the larger alone is the better guess
         trials = [_join(solver, large, small, like) for like in ([large, small], [large])]
         for trial in trials:
             trial.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
-        left = [_look_ahead(trial) for trial in trials]
-        if min(left) < before:
-            before, solver = min(left), trials[int(np.argmin(left))]
-            doubles = _list_doubles(solver)
+        best = min(trials, key=_measure_misfit)
+        if _measure_misfit(best) < _measure_misfit(solver):
+            solver, doubles = best, _list_doubles(best)
     return solver
 
 
@@ -305,10 +305,11 @@ def _join(solver: AmplitudeSolver, large: int, small: int, like: list[int]) -> A
     return joined
 
 
-def _look_ahead(solver: AmplitudeSolver) -> float:
-    """The objective after a step on ranges."""
-    ahead = copy.copy(solver.model)
-    return compute_objective(ahead, refine_state(ahead, solver.amplitude).rest)
+def _measure_misfit(solver: AmplitudeSolver) -> float:
+    """The weighted sum of squares of what surfaces leave of the shot."""
+    model = solver.model
+    rest = model.image - model.render(solver.amplitude)
+    return float(np.sum(model.weights * rest**2, dtype=np.float64))
 
 
 def straighten_surfaces(
