@@ -250,13 +250,15 @@ class RingBuffer:
         self._capacity, self._policy, self._ledger = capacity, policy, ledger
         self._pieces: deque[Piece] = deque()
         self._bytes = 0
-        self._changed = threading.Condition()
+        # Entered by itself: Ctrl-C between the lines of a condition's `__enter__` would leave it locked.
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
         self._ended = False
         self._fault: BaseException | None = None
 
     def put(self, piece: Piece) -> None:
         """Append a piece; with policy ``"block"``, once there is room or the ring has ended."""
-        with self._changed:
+        with self._lock:
             self._ledger.receive(piece.records)
             if self._policy == "block":
                 self._changed.wait_for(lambda: self._has_room(piece) or self._ended)
@@ -274,7 +276,7 @@ class RingBuffer:
 
     def get(self, timeout: float) -> Piece | None:
         """Take the oldest piece; None at the end of the stream."""
-        with self._changed:
+        with self._lock:
             if not self._changed.wait_for(
                 lambda: self._pieces or self._ended or self._fault, timeout
             ):
@@ -292,21 +294,21 @@ class RingBuffer:
 
     def keep_newest(self) -> None:
         """From now on, keep only the newest piece, and count the others as dropped."""
-        with self._changed:
+        with self._lock:
             self._policy, self._capacity = "drop_oldest", 1
             self._drop_oldest()
             self._changed.notify_all()
 
     def fail(self, fault: BaseException) -> None:
         """End the stream with an exception; the first one counts."""
-        with self._changed:
+        with self._lock:
             # Later faults are mostly consequences of the first.
             self._fault = self._fault or fault
             self._changed.notify_all()
 
     def end(self) -> None:
         """End the stream; what is in it can still be taken, and no writer waits any more."""
-        with self._changed:
+        with self._lock:
             self._ended = True
             self._changed.notify_all()
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from threading import Condition, Thread
+from threading import Condition, RLock, Thread
 from time import perf_counter
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -229,8 +229,10 @@ class _Stream:
         self._queue_size, self._drops = queue_size, drops
         self._waiting: deque[_Arrival] = deque()
         self._started: deque[_Entry] = deque()
-        # One lock for all fields; every change wakes both sides, which test again in a loop.
-        self._changed = Condition()
+        # One lock for all fields; every change wakes both sides, which test again in a loop. Entered by
+        # itself: Ctrl-C between the lines of a condition's `__enter__` would leave it locked.
+        self._lock = RLock()
+        self._changed = Condition(self._lock)
         self._closed = self._ended = False
         self._fault: BaseException | None = None
 
@@ -247,14 +249,14 @@ class _Stream:
                 began = perf_counter()
         except BaseException as fault:  # the consumer gets to see it
             self._fault = fault
-        with self._changed:
+        with self._lock:
             self._ended = True
             self._changed.notify_all()
         if self._closed:  # on this thread: a generator cannot be closed while another one runs it
             getattr(items, "close", lambda: None)()
 
     def _bring(self, arrival: _Arrival) -> None:
-        with self._changed:
+        with self._lock:
             while len(self._waiting) >= self._queue_size and not self._closed:
                 if self._drops:
                     self._waiting.popleft()
@@ -273,7 +275,7 @@ class _Stream:
 
     def wait_for_next(self) -> _Entry | None:
         """Return what was started first; behind the last one None, or the source's fault."""
-        with self._changed:
+        with self._lock:
             while not self._started and not self._ended:
                 self._changed.wait()
             if self._started:
@@ -284,13 +286,13 @@ class _Stream:
 
     def make_room(self) -> None:
         """Say that a result has been taken."""
-        with self._changed:
+        with self._lock:
             self._room += 1
             self._start_waiting()
 
     def skip_to_newest(self, entry: _Entry) -> _Entry:
         """Drop results that were finished while the consumer was busy; what failed is not newer."""
-        with self._changed:
+        with self._lock:
             while self._started and (later := self._started[0][1]).done() and not later.exception():
                 entry = self._started.popleft()
                 self._room += 1
@@ -299,7 +301,7 @@ class _Stream:
 
     def close(self) -> None:
         """Let go of everything; nothing is started from now on."""
-        with self._changed:
+        with self._lock:
             self._closed = True
             self._waiting.clear()  # memory is freed even while the reader still runs
             self._changed.notify_all()
