@@ -255,17 +255,20 @@ def join_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
     follow these take the table's light for theirs.
     """
     doubles = _list_doubles(solver)
-    if doubles:
-        solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+    if not doubles:
+        return solver
+    solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+    before = _measure_misfit(solver)
     while doubles:
         large, small = doubles.pop(0)
         # where the smaller is far off, the larger alone is the better guess
         trials = [_join(solver, large, small, like) for like in ([large, small], [large])]
         for trial in trials:
             trial.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
-        best = min(trials, key=_measure_misfit)
-        if _measure_misfit(best) < _measure_misfit(solver):
-            solver, doubles = best, _list_doubles(best)
+        left = [_measure_misfit(trial) for trial in trials]
+        if min(left) < before:
+            before, solver = min(left), trials[int(np.argmin(left))]
+            doubles = _list_doubles(solver)
     return solver
 
 

@@ -259,9 +259,8 @@ class NormalEquations:
         ranges = "coefficients", "patterns"
         surfaces = np.array([number if name in ranges else -1 for name, number, _ in self.names])
         scores = np.zeros((len(self.clusters), self.slope.size))
-        informed: dict[
-            int, list[tuple[int, Pixels]]
-        ] = {}  # by which clusters, with which of their own
+        # of each surface, which clusters say anything of it, and by which of their own numbers
+        informed: dict[int, list[tuple[int, Pixels]]] = {}
         for number, cluster in enumerate(self.clusters):
             scores[number, cluster.numbers] = cluster.score
             owners = surfaces[cluster.numbers]

@@ -134,7 +134,8 @@ def _judge_points(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
 def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]:
     """Numbers of the candidates among the points, and what `FALSE_ODDS` weighs of each, (5, candidates)."""
     solver, model, seen = fit.solver, fit.solver.model, fit.seen
-    significance = solver.measure_significance()
+    variance = solver.estimate_local_variance()
+    significance = solver.measure_significance(variance)
     shown = find_candidates(solver, significance, limit)
     # Light of a line of one range may lie anywhere in a lens about it: of such a surface the two
     # explanations are unlike where they are as probable: a recorded shot, which neither explains to the
@@ -146,7 +147,7 @@ def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]
     bright, brightest = sparse.compare_places()
     light, sparsely = (model.render(one.amplitude) for one in (solver, fit.sparse))
     change = (model.image - sparsely) ** 2 - (model.image - light) ** 2
-    change *= model.weights / solver.estimate_local_variance()
+    change *= model.weights / variance
     place = partial(scipy.ndimage.uniform_filter, size=NEIGHBOURHOOD_PX, mode="constant")
     worse = solver.map_pictures(place, share_misfit(model, solver.amplitude, light, change))
     moved = np.maximum(solver.compare_places()[0] - bright, 0)
