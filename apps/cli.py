@@ -22,6 +22,7 @@ import textwrap
 import threading
 import traceback
 import warnings
+from _thread import interrupt_main
 from collections.abc import Iterator, Sequence
 from functools import partial
 from importlib import import_module
@@ -473,6 +474,19 @@ def _heed_end_signals() -> None:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, signal.default_int_handler)
+    sys.unraisablehook = _interrupt_again
+
+
+def _interrupt_again(lost: Any) -> None:
+    """Repeat a Ctrl-C that came where Python lets no exception out, as while an import forgets its
+    lock: once in a hundred at start-up the program would go on.
+    """
+    if lost.exc_type is KeyboardInterrupt:
+        again = threading.Timer(0.01, interrupt_main)
+        again.daemon = True
+        again.start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _report_error(fault: Exception) -> int:

@@ -36,6 +36,7 @@ from devices.source import (
 from tofclip.errors import (
     DeviceBusyError,
     DeviceDisconnectedError,
+    DeviceError,
     DeviceNotFoundError,
     DevicePermissionError,
     DeviceTimeoutError,
@@ -168,6 +169,7 @@ class StreamSource(DecodedSource):
         capacity = int(options.buffer_mib * _MEBIBYTE)
         self._ring = RingBuffer(capacity, options.policy, feed.ledger)
         self._stopping, self._closed = threading.Event(), False
+        self._owned = threading.Lock()  # the feed, by the thread that uses it up to its end
         self._thread = threading.Thread(target=self._run_reader, name="device reader", daemon=True)
         try:
             feed.start()
@@ -176,8 +178,13 @@ class StreamSource(DecodedSource):
             _open_sources.add(self)
             self._thread.start()
         except BaseException:
-            # Also a signal to end: nothing else could switch the instrument off now.
-            feed.close()
+            # Also a signal to end: nothing else could switch the instrument off now, unless the
+            # thread runs already. What fails meanwhile must not hide why this ended.
+            if self._owned.acquire(blocking=False):
+                with contextlib.suppress(DeviceError):
+                    feed.close()
+            else:
+                self.close()
             raise
 
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
@@ -205,6 +212,8 @@ class StreamSource(DecodedSource):
         Whatever goes wrong here, `read` raises it: a thread that ended without a word would look
         like an instrument in the dark.
         """
+        if not self._owned.acquire(blocking=False):
+            return
         # The feed is closed even if reading failed, and on the thread that used it.
         for step in (self._pull_all, self._count_truncated, self._feed.close, self._release):
             try:

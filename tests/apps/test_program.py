@@ -208,6 +208,15 @@ class TestInterruption:
         done = start([*PROGRAM, "info", "there.h5"], tmp_path, tmp_path)
         assert (done.returncode, done.stderr.count("\n")) == (130, 1)
 
+    def test_ctrl_c_where_python_drops_exceptions_comes_again(self, tmp_path):
+        """As in what is called when an object goes: imports have such callbacks."""
+        gone = "class Gone:\n def __del__(self):\n  raise KeyboardInterrupt\n"
+        wait = "import time\nfor _ in range(400):\n time.sleep(0.05)\n"
+        (tmp_path / "h5py.py").write_text(f"{gone}Gone()\n{wait}")
+        (tmp_path / "there.h5").touch()
+        done = start([*PROGRAM, "info", "there.h5"], tmp_path, tmp_path)
+        assert (done.returncode, done.stderr.count("\n")) == (130, 1)
+
     def test_little_is_loaded_before_a_ctrl_c_can_be_caught(self, tmp_path):
         (tmp_path / "lazy_loader.py").write_text("raise KeyboardInterrupt\n")
         done = start([*PROGRAM, "--version"], tmp_path, tmp_path)

@@ -3,6 +3,7 @@ instrument's clock estimated from messages that are delayed, and a connection th
 """
 
 import resource
+import threading
 import time
 from pathlib import Path
 
@@ -25,9 +26,10 @@ from devices.source import (
     as_bytes,
 )
 from devices.stream import WINDOW_S, InstrumentClock, StreamOptions, StreamSource
-from devices.timetag_codec import RECORD_BYTES
+from devices.timetag_codec import RECORD_BYTES, TimeTagCodec
 from tofclip.errors import (
     BufferOverflowError,
+    DeviceDisconnectedError,
     DeviceTimeoutError,
 )
 
@@ -117,6 +119,27 @@ def test_a_reader_thread_never_dies_silently(method, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         list(source)
     source.close()
+
+
+@pytest.mark.parametrize("is_under_way", [False, True])
+def test_ctrl_c_while_a_source_opens_is_not_hidden_by_what_breaks_then(monkeypatch, is_under_way):
+    """The instrument is let go of once, by the thread that uses it where one does already."""
+    closers, begin = [], threading.Thread.start
+
+    class Feed(RepeatingFeed):
+        def close(self):
+            closers.append(threading.current_thread().name)
+            raise DeviceDisconnectedError("the connection broke")
+
+    def interrupt(thread):
+        if is_under_way:
+            begin(thread)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(threading.Thread, "start", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        StreamSource(Feed(TimeTagCodec(), lambda _: bytes(RECORD_BYTES), 1000, 0.01))
+    assert closers == ["device reader" if is_under_way else "MainThread"]
 
 
 def test_the_least_delay_remains_in_the_estimate_and_nothing_else():
