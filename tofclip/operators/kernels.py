@@ -192,46 +192,6 @@ def back_project_lines(lines, starts, rightward, downward, picture):
 
 
 @fast_loop
-def count_line_nonzeros(starts, rightward, downward, before, shape, counts):
-    """Count the nonzeros in each row of the matrix that `project_onto_lines` stands for into `counts`
-    (lines, detector pixels), zeros; `before` bins lie in front of the detector's first pixel.
-    """
-    for number in range(starts.size):
-        for row in range(shape[0]):
-            start = starts[number] + row * downward[number]
-            for column in range(shape[1]):
-                position = start + column * rightward[number]
-                reading = (position >> FRACTION_BITS) - before
-                if 0 <= reading < counts.shape[1]:
-                    counts[number, reading] += 1
-                if 0 <= reading + 1 < counts.shape[1] and position & FRACTION_MASK:
-                    counts[number, reading + 1] += 1
-
-
-@fast_loop
-def fill_line_nonzeros(starts, rightward, downward, before, shape, places, columns, values):
-    """Write the nonzeros that `count_line_nonzeros` counted. `places`, (lines, detector pixels),
-    says where each row of the matrix begins in `columns` and `values`, and says afterwards where it
-    ends.
-    """
-    whole, step = values.dtype.type(1), values.dtype.type(1 / (1 << FRACTION_BITS))
-    for number in range(starts.size):
-        for row in range(shape[0]):
-            start = starts[number] + row * downward[number]
-            for column in range(shape[1]):
-                position = start + column * rightward[number]
-                reading, share = (
-                    (position >> FRACTION_BITS) - before,
-                    values.dtype.type(position & FRACTION_MASK) * step,
-                )
-                for bin_number, weight in ((reading, whole - share), (reading + 1, share)):
-                    if 0 <= bin_number < places.shape[1] and (bin_number == reading or share != 0):
-                        place = places[number, bin_number]
-                        columns[place], values[place] = row * shape[1] + column, weight
-                        places[number, bin_number] = place + 1
-
-
-@fast_loop
 def transform_walsh_hadamard(values):
     """Multiply (n, columns) values by Sylvester's Hadamard matrix of n = 2^k rows, in place."""
     count, columns = values.shape

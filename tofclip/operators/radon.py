@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, DTypeLike
 from tofclip.arrays import Array, IntArray
 from tofclip.errors import ShapeError, require
 from tofclip.operators.base import LinearOperator
-from tofclip.operators.sparse import SparseMatrix
+from tofclip.operators.sparse import SparseMatrix, share_light
 
 if TYPE_CHECKING:
     import scipy.sparse
@@ -77,24 +77,15 @@ class RadonProjection(SparseMatrix):
         """The CSR matrix, (angles * detector_px, rows * columns); made on first use."""
         import scipy.sparse
 
-        from tofclip.operators.kernels import count_line_nonzeros, fill_line_nonzeros
-
         before, _, paths = self._line_paths
-        counts = np.zeros((self.angles.size, self.detector_px), np.int64)
-        count_line_nonzeros(*paths, before, self.shape_in, counts)
-        ends = np.cumsum(counts)
-        columns, values = np.empty(ends[-1], np.int32), np.empty(ends[-1], self.dtype)
-        fill_line_nonzeros(
-            *paths,
-            before,
-            self.shape_in,
-            # where each row of the matrix begins
-            (ends - counts.ravel()).reshape(counts.shape),
-            columns,
-            values,
-        )
-        shape = (self.shape_out[0], self.shape_in[0] * self.shape_in[1])
-        made = scipy.sparse.csr_array((values, columns, np.append(0, ends)), shape=shape)
+        row, column = np.indices(self.shape_in)
+        lines = []
+        for start, right, down in zip(*paths, strict=True):
+            position = start + column * right + row * down
+            left = (position >> FRACTION_BITS) - before
+            share = (position & ((1 << FRACTION_BITS) - 1)) * 2.0**-FRACTION_BITS
+            lines.append(share_light(left, share, 1.0, self.detector_px, self.dtype))
+        made = scipy.sparse.vstack(lines, "csr")
         return SparseMatrix(made, self.shape_in, self.shape_out).matrix
 
     @cached_property

@@ -17,6 +17,7 @@ from tofclip.arrays import (
     AnyArray,
     Array,
     ComputeDevice,
+    FloatArray,
     IntArray,
     PerDevice,
     is_numpy,
@@ -225,8 +226,6 @@ class LineProjection(SparseMatrix):
         gains: ArrayLike,
         dtype: DTypeLike = np.float32,
     ) -> None:
-        import scipy.sparse
-
         self.centres_px = np.asarray(centres_px, dtype=np.float64)
         self.angles = np.asarray(angles, dtype=np.float64)
         self.gains = np.asarray(gains, dtype=np.float64)
@@ -238,13 +237,24 @@ class LineProjection(SparseMatrix):
         views = (np.s_[:], np.newaxis, np.newaxis)
         position = self.centres_px[views] + x - y * np.tan(self.angles)[views]
         left = np.floor(position).astype(np.int64)
-        share = position - left
-        # each pixel's light goes to the two slit pixels nearest to where it falls
-        slit = np.stack([left, left + 1])
-        weight = np.stack([1.0 - share, share]) * self.gains[views]
-        # no explicit zeros, which every product would pay for
-        seen = (slit >= 0) & (slit < slit_width_px) & (weight != 0)
-        pixel = np.broadcast_to(np.arange(rows * columns).reshape(image_shape), slit.shape)
-        entries = weight[seen].astype(dtype), (slit[seen], pixel[seen])
-        matrix = scipy.sparse.csr_array(entries, shape=(slit_width_px, rows * columns))
+        matrix = share_light(left, position - left, self.gains[views], slit_width_px, dtype)
         super().__init__(matrix, image_shape, (slit_width_px,))
+
+
+def share_light(
+    left: IntArray, share: FloatArray, gain: ArrayLike, width_px: int, dtype: DTypeLike
+) -> scipy.sparse.csr_array:
+    """Return the CSR matrix (width_px, rows * columns) of a picture's projections onto one line, on
+    which every pixel's light falls between pixel `left` (..., rows, columns) and the next, which gets
+    its `share`; what falls beyond the line is lost.
+    """
+    import scipy.sparse
+
+    rows, columns = left.shape[-2:]
+    place = np.stack([left, left + 1])
+    weight = np.stack([1.0 - share, share]) * gain
+    # no explicit zeros, which every product would pay for
+    seen = (place >= 0) & (place < width_px) & (weight != 0)
+    pixel = np.broadcast_to(np.arange(rows * columns).reshape(rows, columns), place.shape)
+    entries = weight[seen].astype(dtype), (place[seen], pixel[seen])
+    return scipy.sparse.csr_array(entries, shape=(width_px, rows * columns))
