@@ -41,7 +41,7 @@ def weight_searches(monkeypatch):
 
     def choose_quickly(_, __, measurements, *___, **____):
         searches.append(measurements.size)
-        return WeightChoice(2e-3, np.array([2e-3]), np.array([1.0]))
+        return WeightChoice(2e-3, np.array([1.0]))
 
     monkeypatch.setattr("tofclip.recovery.light_field.choose_weight", choose_quickly)
     return searches

@@ -151,7 +151,7 @@ class TestStudies:
     ):
         # rows and steps are at stake here; the search for weights has tests of its own and takes
         # most of the time
-        found = WeightChoice(2e-2, np.array([2e-2]), np.array([1.0]))
+        found = WeightChoice(2e-2, np.array([1.0]))
         monkeypatch.setattr("tofclip.recovery.light_field.choose_weight", lambda *_, **__: found)
         (study,) = find_studies(name)
         steps = []

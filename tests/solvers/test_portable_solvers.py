@@ -9,7 +9,7 @@ import pytest
 from array_places import DEVICE_NAMES, find_device
 
 from tofclip.arrays import ComputeDevice, to_numpy
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError
 from tofclip.operators import Diagonal, FourierShear, LineProjection, Stack, estimate_squared_norm
 from tofclip.solvers import (
     Backprojection,
@@ -160,7 +160,6 @@ def test_what_has_only_compiled_loops_says_so(device):
         ("LightFieldVariation", lambda: LightFieldVariation().recover(projection(), measurements)),
         ("a denoiser", lambda: PlugAndPlay(Sparse()).recover(projection(), measurements)),
         ("weight", lambda: choose_weight(Sparse(), projection(), measurements[:, 0], 5)),
-        ("FourierShear", lambda: shear(device.put(picture))),
         ("FourierShear", lambda: stack.H.H(device.put(picture))),
         ("FourierShear", lambda: Sparse().recover(projection() @ shear, measurements)),
     ):
@@ -174,18 +173,10 @@ def test_what_has_only_compiled_loops_says_so(device):
 @every_method
 def test_unusable_readings_are_refused(device, method):
     measurements, valid = letters(2)
-    for wrong, mask, why in (
-        (np.where(valid, measurements, np.nan), None, "NaN"),
-        (measurements[:-1], None, "must have shape"),
-        (measurements, valid[:, :1], "must have shape"),
-    ):
-        with pytest.raises(InputError, match=why):
-            method.recover(
-                projection(), device.put(wrong), None if mask is None else device.put(mask)
-            )
+    with pytest.raises(InputError, match="NaN"):
+        method.recover(projection(), device.put(np.where(valid, measurements, np.nan)))
     with pytest.raises(InputError, match="do not work together"):
         method.recover(projection(), device.put(measurements), valid)
-    with pytest.raises(ShapeError):
-        LeastSquares(device.put(measurements), device.put(valid[:, :1]))
-    with pytest.raises(InputError, match="no view sees anything"):
-        Sparse().recover(projection(), device.put(np.zeros((90, 3), np.float32)))
+    if method.has_prior:
+        with pytest.raises(InputError, match="no view sees anything"):
+            method.recover(projection(), device.put(0 * measurements))

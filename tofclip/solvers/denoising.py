@@ -187,7 +187,6 @@ class PlugAndPlay(Method):
 
     @property
     def has_prior(self) -> bool:
-        """True: the denoiser stands for one."""
         return True
 
     def with_data_term(self, data_term: DataTermMaker) -> Self:

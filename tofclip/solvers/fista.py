@@ -214,21 +214,11 @@ class ProximalMethod(Method):
     weight : float
         Regularisation relative to the largest value of ``A'f`` over all frames. At 1 the sparsest
         solution, zero, is reached; the scale of the measurements does not matter.
-    iterations : int
-        Maximum number for each frame.
-    tolerance : float
-        Relative change of a block's objective below which it is done; 0: never. What a block is
-        depends on the arrays (`Blocks`), and with it when its frames are done.
+    iterations, tolerance, gap, further, noise_fall : int or float
+        When a block of frames is done, see `StoppingRule`. What a block is depends on the arrays
+        (`Blocks`), and with it when its frames are done.
     data_term : DataTermMaker
         What a misfit costs.
-    gap : float
-        A block is done as soon as every frame's objective is above the least one by at most this
-        fraction of it, as the duality gap says, for priors that have one; 0: never.
-    further : int
-        Iterations that may follow for blocks whose objective still falls, see `StoppingRule`.
-    noise_fall : float
-        Fall of the objective in an iteration, relative, below which a block of little more than noise
-        is done, see `StoppingRule`.
     """
 
     weight: float
@@ -247,7 +237,6 @@ class ProximalMethod(Method):
 
     @property
     def has_prior(self) -> bool:
-        """True: see `Method`."""
         return True
 
     def with_data_term(self, data_term: DataTermMaker) -> Self:
@@ -423,8 +412,8 @@ class WeightChoice:
     """The weights tried and what their recoveries failed to predict."""
 
     weight: float  # the best, between those tried
-    trial_weights: FloatArray  # (trials,), ascending
-    # (trials,), value of the data term on the measurements held out, all folds together
+    # (trials,), value of the data term on the measurements held out, all folds together, by the
+    # weights that were tried, ascending
     errors: FloatArray
 
 
@@ -492,9 +481,7 @@ def assign_folds(count: int, run: int, seed: int) -> BoolArray:
     return np.repeat(dealt, run)[:count, np.newaxis] == np.arange(used)
 
 
-def _search_downhill(
-    error: Callable[[float], float], first: float = INITIAL_WEIGHT
-) -> WeightChoice:
+def _search_downhill(error: Callable[[float], float], first: float) -> WeightChoice:
     """Try weights up or down from `first`, whichever lowers the error, until it rises again."""
     # On a logarithmic axis the error has one valley: two trials say which way it goes down.
     errors = {step: error(first * WEIGHT_RATIO**step) for step in (0, 1)}
@@ -512,5 +499,4 @@ def _search_downhill(
         # The minimum of the parabola through three trials lies between the tried weights.
         left, middle, right = values[number - 1 : number + 2]
         lowest += 0.5 * (left - right) / (left - 2 * middle + right)
-    weights = first * WEIGHT_RATIO**steps
-    return WeightChoice(float(first * WEIGHT_RATIO**lowest), weights, values)
+    return WeightChoice(float(first * WEIGHT_RATIO**lowest), values)
