@@ -303,7 +303,10 @@ class Capture:
                 "these frames carry no relay wall: recover them from a streak image converted with its wall's geometry"
             )
         wall = record.array("wall", np.float64, 3, "m")
-        camera, laser = (record.array(name, np.float64, 1, "m") for name in ("camera", "laser"))
+        camera, laser = (
+            _require_position(name, record.array(name, np.float64, 1, "m"))
+            for name in ("camera", "laser")
+        )
         bin_width, steps = frames.bin_width, np.diff(frames.times)
         if np.max(np.abs(steps - bin_width)) > STEP_TOLERANCE * bin_width:
             raise InputError(
@@ -311,6 +314,8 @@ class Capture:
                 "spaced ones: recover with one `bin_width`"
             )
         row, column = (int(record.number(f"{name}_offset")) for name in ("row", "column"))
+        if wall.shape[-1] != 3:
+            raise ShapeError("wall", "(rows, columns, 3)", wall.shape)
         (rows, columns), (high, wide) = wall.shape[:2], frames.values.shape[1:]
         if min(row, column) < 0 or row + rows > high or column + columns > wide:
             raise InputError(
@@ -320,7 +325,8 @@ class Capture:
         seen = frames.values[:, row : row + rows, column : column + columns]
         delay = record.number("receive_delay_bins")
         start = SPEED_OF_LIGHT * (float(frames.times[0]) + delay * bin_width)
-        signal = unwarp_signal(seen, wall, camera, laser, bin_width)
+        legs = norm(wall - camera, axis=-1) - norm(laser - camera)
+        signal = _shift_earlier(to_numpy(seen), legs / (SPEED_OF_LIGHT * bin_width))
         return cls(signal, wall, laser, bin_width, start, frames.provenance)
 
     def to_record(self) -> Record:
@@ -402,22 +408,6 @@ def _to_real_array(values: Any, dtype: type, name: str) -> AnyArray:
 
 # Of its mean, what steps of a time axis may differ by: less than a bin over 1000.
 STEP_TOLERANCE = 1e-3
-
-
-def unwarp_signal(
-    signal: Any, wall: Any, camera: Any, laser: Any, bin_width: float
-) -> Float32Array:
-    """Shift every wall point's signal (t, ...) earlier by ``(|r_p - camera| - |laser - camera|) /
-    c``, so that bins hold one path laser spot -> hidden point -> wall point; linear between bins, 0
-    outside and where a wall point (..., 3) is NaN. The result is NumPy's.
-    """
-    signal = np.asarray(to_numpy(signal), dtype=np.float32)
-    wall = np.asarray(wall, dtype=np.float64)
-    camera, laser = (_require_position(*one) for one in (("camera", camera), ("laser", laser)))
-    if signal.shape[1:] != wall.shape[:-1] or wall.shape[-1:] != (3,):
-        raise ShapeError("wall", (*signal.shape[1:], 3), wall.shape)
-    leg = norm(wall - camera, axis=-1) - norm(laser - camera)
-    return _shift_earlier(signal, leg / (SPEED_OF_LIGHT * bin_width))
 
 
 def remove_device_legs(capture: Capture, source: Any, camera: Any) -> Capture:

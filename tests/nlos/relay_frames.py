@@ -19,9 +19,9 @@ def wall_of(rows, columns):
     return np.stack([x, y, 0.03 * np.sin(9 * x)], axis=-1)
 
 
-def relay_wall(wall, without="", **changes):
+def relay_wall(wall, without="", camera=CAMERA, **changes):
     offsets = {"row_offset": ROW_OFFSET, "column_offset": COLUMN_OFFSET}
-    fields = {"wall": Field(wall, "m"), "camera": Field(CAMERA, "m"), "laser": Field(LASER, "m")}
+    fields = {"wall": Field(wall, "m"), "camera": Field(camera, "m"), "laser": Field(LASER, "m")}
     fields.pop(without, None)
     return Record("relay_wall", fields, {**offsets, "receive_delay_bins": DELAY_BINS, **changes})
 

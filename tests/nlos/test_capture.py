@@ -24,7 +24,7 @@ from scenes import find_refusal, planar_wall
 
 from nlos import Backprojection, Capture, Grid
 from nlos.band import Band
-from nlos.capture import remove_device_legs, unwarp_signal
+from nlos.capture import remove_device_legs
 from nlos.illumination import AliasingWarning, warn_of_aliasing
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.storage import Record
@@ -245,6 +245,8 @@ UNEVEN = BIN_WIDTH * np.array([0, 1, 2.1, 3])
         (None, None, InputError, "carry no relay wall"),
         (Record("shopping_list"), None, InputError, "carry no relay wall"),
         (relay_wall(wall_of(4, 4), without="camera"), None, FileFormatError, "no field 'camera'"),
+        (relay_wall(wall_of(4, 4), camera=CAMERA * np.nan), None, InputError, "camera position"),
+        (relay_wall(wall_of(4, 4)[..., :2]), None, ShapeError, "wall"),
         (relay_wall(wall_of(4, 4), row_offset=-1), None, InputError, "does not fit"),
         (relay_wall(wall_of(4, 4), row_offset=6), None, InputError, "does not fit"),
         (relay_wall(wall_of(4, 4), column_offset=7), None, InputError, "does not fit"),
@@ -255,16 +257,3 @@ def test_frames_that_are_no_capture_say_why(attached, times, error, message):
     attachments = {} if attached is None else {"relay_wall": attached}
     with pytest.raises(error, match=message):
         Capture.from_frames(frames_of(np.ones((4, 9, 10)), attachments, times))
-
-
-@pytest.mark.parametrize(
-    ("signal", "wall", "camera", "laser", "message"),
-    [
-        ((5, 2, 3), (2, 2, 3), CAMERA, LASER, "wall"),
-        ((5, 2), (2, 3), [0, np.nan, 0], LASER, "camera position"),
-        ((5, 2), (2, 3), CAMERA, [0, 0], "laser position"),
-    ],
-)
-def test_unwarping_checks_what_it_is_given(signal, wall, camera, laser, message):
-    with pytest.raises(InputError, match=message):
-        unwarp_signal(np.ones(signal), np.zeros(wall), camera, laser, BIN_WIDTH)
