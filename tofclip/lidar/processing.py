@@ -14,7 +14,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from tofclip.arrays import AnyArray, BoolArray, FloatArray, IndexArray
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError, ShapeError, require_positive
 from tofclip.files import import_open3d
 from tofclip.lidar.cloud import PROPERTY_COLUMNS, PointCloud
 from tofclip.units import MAD_TO_SIGMA
@@ -60,8 +60,7 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     """Return one point for each occupied cube of side `voxel`, m: means of its points. Deviations
     of independent points shrink with their number; the return number is the least.
     """
-    if not (np.isfinite(voxel) and voxel > 0):
-        raise InputError(f"the side of a voxel must be a positive length, got {voxel}")
+    require_positive("the side of a voxel", voxel, "length")
     if len(cloud) == 0:
         return cloud
     cell = np.floor(cloud.xyz / np.float64(voxel)).astype(np.int64)

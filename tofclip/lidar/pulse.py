@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofclip.arrays import FloatArray
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_positive
 from tofclip.units import FWHM_PER_SIGMA
 
 SAMPLES_PER_FWHM = 128  # linear interpolation then errs by less than 2e-5 of the peak
@@ -51,10 +51,7 @@ class Pulse:
         usable = samples.ndim == 1 and samples.size >= 3 and np.all(np.isfinite(samples))
         if not (usable and samples.max() > 0):
             raise InputError("a pulse needs at least three finite samples, one of them positive")
-        if not (np.isfinite(self.spacing) and self.spacing > 0):
-            raise InputError(
-                f"the spacing of a pulse's samples must be a positive time, got {self.spacing}"
-            )
+        require_positive("the spacing of a pulse's samples", self.spacing, "time")
         if not 0 <= self.origin <= samples.size - 1:
             raise InputError(
                 f"the origin of a pulse must lie within its samples, got {self.origin}"
@@ -66,8 +63,7 @@ class Pulse:
     @classmethod
     def gaussian(cls, fwhm: float) -> Pulse:
         """Return a Gaussian of full width at half maximum `fwhm`, s, whose arrival is its peak."""
-        if not (np.isfinite(fwhm) and fwhm > 0):
-            raise InputError(f"the width of a pulse must be a positive time, got {fwhm}")
+        require_positive("the width of a pulse", fwhm, "time")
         half = int(EXTENT_FWHM * SAMPLES_PER_FWHM)
         widths = np.arange(-half, half + 1) / SAMPLES_PER_FWHM
         return cls(np.exp2(-((2 * widths) ** 2)), fwhm / SAMPLES_PER_FWHM, float(half))
@@ -96,10 +92,8 @@ class Pulse:
         """
         from scipy.stats import exponnorm
 
-        if not (np.isfinite(fwhm) and fwhm > 0 and np.isfinite(decay) and decay > 0):
-            raise InputError(
-                f"width and decay of a pulse must be positive times, got {fwhm} and {decay}"
-            )
+        require_positive("the width of a pulse", fwhm, "time")
+        require_positive("the decay of a pulse", decay, "time")
         if not EXTENT_DECAYS * decay * SAMPLES_PER_FWHM <= MAX_SAMPLES * fwhm:
             raise InputError(
                 f"a decay of {decay:g} s does not go with a width of {fwhm:g} s; check their units"
@@ -121,8 +115,7 @@ class Pulse:
         InputError
             A width that is not positive, or so far from the pulse's that one of the units is wrong.
         """
-        if not (np.isfinite(bin_width) and bin_width > 0):
-            raise InputError(f"the width of a bin must be a positive time, got {bin_width}")
+        require_positive("the width of a bin", bin_width, "time")
         spacing = min(self.spacing, bin_width / SAMPLES_PER_BIN)
         length = (self.samples.size - 1) * self.spacing + bin_width
         if not length <= MAX_SAMPLES * spacing:

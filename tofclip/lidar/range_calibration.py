@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from tofclip.camera import Camera, RangeCalibration
-from tofclip.errors import CalibrationError, InputError
+from tofclip.errors import CalibrationError, InputError, require_positive
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.shots import Returns
 from tofclip.units import MAD_TO_SIGMA, MILLIMETRE, SPEED_OF_LIGHT
@@ -269,8 +269,7 @@ class TargetShot:
     brightest: float = np.nan
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.distance) and self.distance > 0):
-            raise InputError(f"a target's distance must be a positive length, got {self.distance}")
+        require_positive("a target's distance", self.distance, "length")
         percent = self.reflectance_percent
         if not (np.isnan(percent) or 0 < percent <= 1000):
             raise InputError(f"a reflectance must be a positive percentage, got {percent}")

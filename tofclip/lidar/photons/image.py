@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 
 from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray
 from tofclip.camera import Camera
-from tofclip.errors import CalibrationError, InputError, ShapeError
+from tofclip.errors import CalibrationError, InputError, ShapeError, require_positive
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.range_calibration import correct_ranges
 from tofclip.shots import Returns
@@ -111,8 +111,7 @@ class PhotonImage:
             raise ShapeError("the offsets of photon events", (pixels + 1,), self.offsets.shape)
         if self.count.shape != self.bin.shape:
             raise ShapeError("the counts of photon events", self.bin.shape, self.count.shape)
-        if not (np.isfinite(self.bin_width) and self.bin_width > 0):
-            raise InputError(f"the width of a bin must be a positive time, got {self.bin_width}")
+        require_positive("the width of a bin", self.bin_width, "time")
         require_credible_bin_width(self.bin_width, shortest=MIN_BIN_WIDTH_S)
         if not self.bin.size:
             raise InputError("no pixel counted a photon")
