@@ -25,6 +25,8 @@ from numba.extending import register_jitable
 logger = logging.getLogger(__name__)
 # What sums in vectors need; unlike all of ``fastmath`` it leaves infinities and NaN what they are.
 SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
+# For loops whose sums stay in the order written, with functions as exact as float32.
+SUMS_AS_WRITTEN = {"contract", "nsz", "arcp", "afn"}
 # For numbers without a sign: beside one with a sign the compiler would make both floats.
 ONE = np.uintp(1)
 # What a full, forbidden or damaged cache raises.

@@ -80,8 +80,6 @@ class InactiveRegion:
         return np.asarray(~(left | right))
 
 
-Array = AnyArray
-
 # Rise of a return above what is around it, in standard deviations of what the measurements say of it one
 # by one. Noise of 2,304 measurements over 38 instants rose by up to 3.0.
 MIN_SIGNIFICANCE = 5.0
@@ -107,7 +105,7 @@ class Rig:
         """The encoders of all views."""
         return self.setup.camera(self.array.image_shape, self.array.views)
 
-    def compute_flight_time(self, distance: Array) -> Array:
+    def compute_flight_time(self, distance: AnyArray) -> AnyArray:
         """Return the mean time of flight, over lamps and views, of points on the axis, s;
         `distance` (n,) in m.
         """
@@ -130,7 +128,7 @@ class Return:
 class TimedMeasurements:
     """Measurements of every view at every instant."""
 
-    values: Array  # (measurements, bins)
+    values: AnyArray  # (measurements, bins)
     rig: Rig
     time_axis: TimeAxis
 
@@ -139,7 +137,7 @@ class TimedMeasurements:
         require_shape("the measurements of this rig", expected, self.values.shape)
 
     @property
-    def history(self) -> Array:
+    def history(self) -> AnyArray:
         """All measurements together at each instant, (bins,)."""
         return self.values.sum(axis=0, dtype=np.float64)
 
@@ -192,7 +190,7 @@ class TimedMeasurements:
         flight_times = self.rig.compute_flight_time(distances)
         return Return(float(np.interp(time, flight_times, distances)), bins)
 
-    def sum_gate(self, bins: slice) -> Array:
+    def sum_gate(self, bins: slice) -> AnyArray:
         """Return the measurements summed over some instants, (measurements,) float32."""
         return self.values[:, bins].sum(axis=1)
 
@@ -202,14 +200,16 @@ class TimedMeasurements:
         return ClipMeasurement(self.sum_gate(bins), array.views, array.image_shape, self.rig.setup)
 
 
-def measure_views(pictures: Array, rig: Rig, time_axis: TimeAxis) -> TimedMeasurements:
+def measure_views(pictures: AnyArray, rig: Rig, time_axis: TimeAxis) -> TimedMeasurements:
     """Measure true views, (views, rows, columns, bins), without noise."""
     camera = rig.camera
     values = camera.light_field_model()(pictures[list(camera.used_views)])
     return TimedMeasurements(values, rig, time_axis)
 
 
-def add_poisson_noise(light: Array, photons_per_unit: float, random: np.random.Generator) -> Array:
+def add_poisson_noise(
+    light: AnyArray, photons_per_unit: float, random: np.random.Generator
+) -> AnyArray:
     """Return light as photon counts report it, in the unit it came in; below zero counts as zero."""
     photons = random.poisson(np.maximum(light, 0) * photons_per_unit)
     return np.asarray(photons / photons_per_unit, np.float32)
@@ -226,9 +226,9 @@ class SeparatedImages:
 
     # (rows, columns), as the reference view sees them at their own shears; the target as if nothing
     # stood before it
-    occluder: Array
-    target: Array
-    plain: Array  # (rows, columns), the target by the model that knows of no occluder
+    occluder: AnyArray
+    target: AnyArray
+    plain: AnyArray  # (rows, columns), the target by the model that knows of no occluder
     # of what sent light back, as the times of flight tell, m: occluder and target, or the occluder
     # alone, and then the target's pictures are dark
     distances: tuple[float, ...]
@@ -239,7 +239,7 @@ class SeparatedImages:
         return len(self.distances) > 1
 
 
-def find_occlusion_mask(occluder: Array) -> Array:
+def find_occlusion_mask(occluder: AnyArray) -> AnyArray:
     """Return the pixels that an occluder's picture fills, (rows, columns) from 0 to 1."""
     from skimage.filters import threshold_otsu
 
@@ -249,7 +249,7 @@ def find_occlusion_mask(occluder: Array) -> Array:
 
 
 def build_occluded_model(
-    rig: Rig, occlusion_mask: Array, shears: tuple[float, float]
+    rig: Rig, occlusion_mask: AnyArray, shears: tuple[float, float]
 ) -> LinearOperator:
     """Return F(d) of a target behind an occluder: lamps' shadows, shear, hidden pixels, encoder of
     each view. The mask is of the pixels that the occluder fills in the reference view; `shears` are
@@ -299,7 +299,7 @@ def separate_occluder(
     return SeparatedImages(occluder, target, pictures[1], distances)
 
 
-def _shear_mask(occlusion_mask: Array, shear: float, view: View) -> Array:
+def _shear_mask(occlusion_mask: AnyArray, shear: float, view: View) -> AnyArray:
     """Return a cover as seen from elsewhere; nothing, if it has left the picture."""
     sides = zip(view, occlusion_mask.shape, strict=True)
     if any(abs(shear * step) >= size for step, size in sides):

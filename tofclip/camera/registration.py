@@ -136,8 +136,6 @@ def _match_curves(curve: FloatArray, reference: FloatArray) -> tuple[float, floa
     return float(best.x[0]), float(best.x[1]), -float(best.fun)
 
 
-Array = Float32Array
-
 MIN_ROUND_COUNT, MAX_ROUND_COUNT = 5, 10
 SETTLED_PX = 0.05  # no centre moves further in a round: enough rounds
 # Three cache blocks, spread over the shot's energy. On simulated shots of 1,900, 200 and 50 photons
@@ -167,7 +165,7 @@ class Registration:
 
 
 def register_views(
-    counts: Array,
+    counts: Float32Array,
     saturated: BoolArray | None,
     camera: Camera,
     progress: Progress = ignore_progress,
@@ -259,7 +257,7 @@ class _Model:
     def __init__(self, camera: Camera, groups: Groups) -> None:
         self._parts = [(frames, camera.operator(shear)) for frames, shear in groups]
 
-    def recover(self, part: Measurement, progress: Progress) -> Array:
+    def recover(self, part: Measurement, progress: Progress) -> Float32Array:
         """Recover the chosen frames, (rows, columns, frames)."""
         pictures = []
         for frames, operator in self._parts:
@@ -268,14 +266,14 @@ class _Model:
             pictures.append(found.frames)
         return np.ascontiguousarray(np.moveaxis(np.concatenate(pictures), 0, -1))
 
-    def predict(self, pictures: Array) -> Array:
+    def predict(self, pictures: Float32Array) -> Float32Array:
         """Return what the camera would measure of the pictures, (columns, frames)."""
         seen = [operator(pictures[..., frames]) for frames, operator in self._parts]
         return np.concatenate(seen, axis=1)
 
 
 def _refine_camera(
-    camera: Camera, start: Camera, evidence: _Evidence, slope: Array, knows_times: bool
+    camera: Camera, start: Camera, evidence: _Evidence, slope: Float32Array, knows_times: bool
 ) -> Camera:
     """Solve for every view's corrections and apply them; the reference view keeps its time, gains
     average 1.
@@ -319,14 +317,14 @@ def _remove_picture_shift(camera: Camera, moves: FloatArray) -> FloatArray:
 class _Evidence:
     """What a round knows: pictures, their groups, and the misfit they leave, at the chosen rows."""
 
-    pictures: Array
+    pictures: Float32Array
     groups: Groups
-    misfit: Array
+    misfit: Float32Array
     valid: BoolArray
     rows: IndexArray
 
     def solve_corrections(
-        self, camera: Camera, view: int, drift: float, slope: Array
+        self, camera: Camera, view: int, drift: float, slope: Float32Array
     ) -> FloatArray:
         """Offset (rows), stretch, relative gain and centre (px) that best explain one view's
         misfit. `slope` (columns, frames) is that of the measurements in time, a row. A centre that

@@ -14,14 +14,12 @@ from tofclip.arrays import AnyArray, FloatArray, IntArray
 from tofclip.errors import ShapeError, require, require_axes, require_shape
 from tofclip.light_field.views import LightField
 
-Array = AnyArray
-
 MAX_ITERATIONS = 40
 MAX_LABEL_STEP = 3  # labels farther apart cost no more: depth may jump at an object's border
 
 
 def find_smooth_labels(
-    costs: Array, smoothness: float, iterations: int = MAX_ITERATIONS
+    costs: AnyArray, smoothness: float, iterations: int = MAX_ITERATIONS
 ) -> IntArray:
     """Choose labels (rows, columns) of low total cost: each pixel's own, of `costs` (labels, rows,
     columns), and `smoothness` times the steps between neighbours; zero takes each pixel's
@@ -58,7 +56,7 @@ def find_smooth_labels(
     return (own + messages.sum(axis=0)).argmin(axis=0)
 
 
-def _pass_message(costs: Array, price: np.float32) -> Array:
+def _pass_message(costs: AnyArray, price: np.float32) -> AnyArray:
     """Cheapest cost of each label l at the neighbour: min over k of ``costs(k) + price(|l - k|)``."""
     cheapest = costs.min(axis=0)
     # truncated: from here on a jump costs the same, however far
@@ -81,7 +79,7 @@ class FocalStack:
     ascending. `ShapeError` or `InputError` where they do not match, hold NaN, or do not ascend.
     """
 
-    pictures: Array
+    pictures: AnyArray
     shears: FloatArray
 
     def __post_init__(self) -> None:
@@ -94,7 +92,7 @@ class FocalStack:
             "a focal stack needs finite pictures and ascending shears",
         )
 
-    def all_in_focus(self, depths: IntArray) -> Array:
+    def all_in_focus(self, depths: IntArray) -> AnyArray:
         """Return the all-in-focus picture: each pixel from the picture whose number is in (rows,
         columns) `depths`.
         """
@@ -114,7 +112,7 @@ def make_focal_stack(
     return FocalStack(np.stack(pictures), depths)
 
 
-def compute_modified_laplacian(pictures: Array) -> Array:
+def compute_modified_laplacian(pictures: AnyArray) -> AnyArray:
     """Second differences of `pictures` (..., rows, columns) along rows and columns, their sizes
     added (S. K. Nayar, Y. Nakagawa, TPAMI 16, 824, 1994).
     """
@@ -126,7 +124,7 @@ def compute_modified_laplacian(pictures: Array) -> Array:
     return down + across
 
 
-def compute_image_energy(pictures: Array) -> Array:
+def compute_image_energy(pictures: AnyArray) -> AnyArray:
     """Squared slopes along rows and columns, added; shapes as in `compute_modified_laplacian`."""
     down, across = np.gradient(pictures, axis=(-2, -1))
     return down**2 + across**2
@@ -134,7 +132,7 @@ def compute_image_energy(pictures: Array) -> Array:
 
 def estimate_depth_from_focus(
     stack: FocalStack,
-    measure: Callable[[Array], Array] = compute_image_energy,
+    measure: Callable[[AnyArray], AnyArray] = compute_image_energy,
     window_px: float = WINDOW_PX,
     smoothness: float = SMOOTHNESS,
 ) -> IntArray:

@@ -18,7 +18,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from tofclip.compiling import compile_as_part, compile_loop, inlined
+from tofclip.compiling import SUMS_AS_WRITTEN, compile_as_part, compile_loop, inlined
 from tofclip.operators.radon import FRACTION_BITS
 from tofclip.threads import LANES
 
@@ -121,8 +121,7 @@ def multiply_sparse_block(tile_starts, columns, values, block, result):
     multiply_sparse_rows(tile_starts, columns, values, block, 0, result, 0)
 
 
-FASTMATH = {"contract", "nsz", "arcp", "afn"}
-fast_loop = compile_loop(fastmath=FASTMATH)
+fast_loop = compile_loop(fastmath=SUMS_AS_WRITTEN)
 
 FRACTION_MASK = (1 << FRACTION_BITS) - 1
 
@@ -216,7 +215,7 @@ def transform_walsh_hadamard(values):
                 values[row + half, column] = a - b
 
 
-@compile_loop(fastmath=FASTMATH, _nrt=True)
+@compile_loop(fastmath=SUMS_AS_WRITTEN, _nrt=True)
 def shift_linearly(block, down, right, below, beside, shifted):
     """Shift a (rows, columns, lanes) block by ``down + below`` rows and ``right + beside`` columns;
     dark beyond. `below` and `beside` are the shares of the next row and column, from 0 to 1.

@@ -18,7 +18,6 @@ import scipy
 from tofclip.arrays import AnyArray, IndexArray
 from tofclip.errors import require, require_axes
 
-Array = AnyArray
 Vector = tuple[float, float, float]
 
 AMBIENT_FRACTION = 0.4  # of the light, that comes from everywhere
@@ -32,23 +31,23 @@ class Hits:
     the ray misses.
     """
 
-    distance: Array
-    normal: Array
-    pattern_position: Array
+    distance: AnyArray
+    normal: AnyArray
+    pattern_position: AnyArray
 
 
 class Shape(ABC):
     """A surface around the origin; x right, y down, z away from the reader."""
 
     @abstractmethod
-    def intersect(self, origin: Array, directions: Array) -> Hits:
+    def intersect(self, origin: AnyArray, directions: AnyArray) -> Hits:
         """Return where rays from (3,) `origin`, m, first meet the surface along (rays, 3)
         `directions`, in whose lengths distances are counted.
         """
 
     @property
     @abstractmethod
-    def half_extent(self) -> Array:
+    def half_extent(self) -> AnyArray:
         """Half of the width, height and thickness of an upright box that holds the shape, m."""
 
 
@@ -60,10 +59,10 @@ class Rectangle(Shape):
     height: float
 
     @property
-    def half_extent(self) -> Array:
+    def half_extent(self) -> AnyArray:
         return np.array([self.width, self.height, 0.0]) / 2
 
-    def intersect(self, origin: Array, directions: Array) -> Hits:
+    def intersect(self, origin: AnyArray, directions: AnyArray) -> Hits:
         """Return where rays meet the plate, from either side; see `Shape.intersect`."""
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = -origin[2] / directions[:, 2]
@@ -83,10 +82,10 @@ class Sphere(Shape):
     radius: float
 
     @property
-    def half_extent(self) -> Array:
+    def half_extent(self) -> AnyArray:
         return np.full(3, self.radius)
 
-    def intersect(self, origin: Array, directions: Array) -> Hits:
+    def intersect(self, origin: AnyArray, directions: AnyArray) -> Hits:
         """Return where rays from outside meet the ball; see `Shape.intersect`."""
         along, square = directions @ origin, np.einsum("ij,ij->i", directions, directions)
         # roots of |origin + t direction|^2 = radius^2; the smaller one is the near side
@@ -110,10 +109,10 @@ class Box(Shape):
     thickness: float
 
     @property
-    def half_extent(self) -> Array:
+    def half_extent(self) -> AnyArray:
         return np.array([self.width, self.height, self.thickness]) / 2
 
-    def intersect(self, origin: Array, directions: Array) -> Hits:
+    def intersect(self, origin: AnyArray, directions: AnyArray) -> Hits:
         """Return where rays from outside meet the block; see `Shape.intersect`.
 
         A ray is inside the block where it is inside all three pairs of faces: between the last
@@ -139,7 +138,7 @@ class Lambertian:
     has nothing but holes, or a reflectance lies outside 0 to 1.
     """
 
-    pattern: Array
+    pattern: AnyArray
 
     def __post_init__(self) -> None:
         known = self.pattern[np.isfinite(self.pattern)]
@@ -149,13 +148,15 @@ class Lambertian:
             "a pattern's reflectances must lie within 0..1 where they are not NaN, and some must be",
         )
 
-    def reflectance(self, place: Array) -> Array:
+    def reflectance(self, place: AnyArray) -> AnyArray:
         """Return the pattern's values at (points, 2) places from 0 to 1, right and down."""
         size = np.array(self.pattern.shape[::-1])
         column, row = np.clip((np.nan_to_num(place) * size).astype(np.int64), 0, size - 1).T
         return self.pattern[row, column]
 
-    def radiance(self, place: Array, normal: Array, directions: Array, light: Array) -> Array:
+    def radiance(
+        self, place: AnyArray, normal: AnyArray, directions: AnyArray, light: AnyArray
+    ) -> AnyArray:
         """Return the light that goes back along rays, (points,), from each `place` on the surface.
 
         `normal` of the surface and `light` towards the lamp have length 1, `directions` towards the
@@ -175,7 +176,9 @@ class Specular(Lambertian):
     gloss: float = 1.0
     exponent: float = 200.0
 
-    def radiance(self, place: Array, normal: Array, directions: Array, light: Array) -> Array:
+    def radiance(
+        self, place: AnyArray, normal: AnyArray, directions: AnyArray, light: AnyArray
+    ) -> AnyArray:
         """Return the light that goes back along rays; arguments as for a matt surface."""
         matt = super().radiance(place, normal, directions, light)
         unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -195,10 +198,10 @@ class Body:
 
     shape: Shape
     material: Material
-    centre: Array
-    axes: Array = field(default_factory=lambda: np.eye(3))
+    centre: AnyArray
+    axes: AnyArray = field(default_factory=lambda: np.eye(3))
 
-    def intersect(self, origin: Array, directions: Array) -> Hits:
+    def intersect(self, origin: AnyArray, directions: AnyArray) -> Hits:
         """Return where rays meet the body, holes of whose pattern let them pass; see
         `Shape.intersect`.
         """
@@ -210,7 +213,7 @@ class Body:
             found.pattern_position,
         )
 
-    def select_candidate_rays(self, origin: Array, directions: Array) -> Array:
+    def select_candidate_rays(self, origin: AnyArray, directions: AnyArray) -> AnyArray:
         """Return the numbers of those rays, all with positive z, that may meet the body, as for
         `Shape.intersect`; most of a picture's do not.
         """
@@ -264,13 +267,15 @@ EXTENT_SIGMAS = 5.0  # a Gaussian leaves 6e-7 of its energy outside
 class FirstHits:
     """What rays meet first."""
 
-    distance: Array  # (rays,), in lengths of the ray's direction; infinite where it meets nothing
-    body: Array  # (rays,), number of the body; `NO_BODY` where there is none
-    normal: Array  # (rays, 3), of length 1, towards the ray's origin
-    pattern_position: Array  # (rays, 2), on the body's pattern
+    distance: (
+        AnyArray  # (rays,), in lengths of the ray's direction; infinite where it meets nothing
+    )
+    body: AnyArray  # (rays,), number of the body; `NO_BODY` where there is none
+    normal: AnyArray  # (rays, 3), of length 1, towards the ray's origin
+    pattern_position: AnyArray  # (rays, 2), on the body's pattern
 
 
-def cast_rays(bodies: Sequence[Body], origin: Array, directions: Array) -> FirstHits:
+def cast_rays(bodies: Sequence[Body], origin: AnyArray, directions: AnyArray) -> FirstHits:
     """Follow rays from (3,) `origin`, m, along (rays, 3) `directions`, all with z > 0, to the nearest
     surface.
     """
@@ -288,7 +293,7 @@ def cast_rays(bodies: Sequence[Body], origin: Array, directions: Array) -> First
     return FirstHits(nearest, number, normal, place)
 
 
-def look_up_reflectance(bodies: Sequence[Body], hits: FirstHits) -> Array:
+def look_up_reflectance(bodies: Sequence[Body], hits: FirstHits) -> AnyArray:
     """Return the pattern's value where each ray hits, (rays,) float64; 0 where it hits nothing."""
     found = np.zeros(hits.body.size)
     for number, one in enumerate(bodies):
@@ -297,7 +302,9 @@ def look_up_reflectance(bodies: Sequence[Body], hits: FirstHits) -> Array:
     return found
 
 
-def compute_irradiance(bodies: Sequence[Body], lamp: Array, points: Array, normal: Array) -> Array:
+def compute_irradiance(
+    bodies: Sequence[Body], lamp: AnyArray, points: AnyArray, normal: AnyArray
+) -> AnyArray:
     """Return how strongly a lamp lights points (points, 3), all of larger z, on surfaces that face
     along `normal`: cosine over distance squared, 1 / m^2, nothing in the shadow of a body.
     """
@@ -322,13 +329,13 @@ def number_ray_pixels(image_shape: tuple[int, int], rays_per_side: int) -> Index
     return numbers.repeat(rays_per_side, axis=0).repeat(rays_per_side, axis=1).ravel()
 
 
-def accumulate_cells(cell: IndexArray, amount: Array, shape: tuple[int, ...]) -> Array:
+def accumulate_cells(cell: IndexArray, amount: AnyArray, shape: tuple[int, ...]) -> AnyArray:
     """Add each amount to its cell, numbered in raster order, of a float64 array of `shape`."""
     total = np.bincount(cell.ravel(), amount.ravel(), minlength=int(np.prod(shape)))
     return np.asarray(total, dtype=np.float64).reshape(shape)
 
 
-def spread_pulse(position: Array, sigma: Array) -> tuple[IndexArray, Array]:
+def spread_pulse(position: AnyArray, sigma: AnyArray) -> tuple[IndexArray, AnyArray]:
     """Integrate Gaussian pulses at `position` (n,), in bins, over the bins around them; bin i
     reaches from i - 1/2 to i + 1/2. Returns the first bin of each pulse, and (n, reach) fractions
     of its energy in that bin and those after it.
@@ -344,8 +351,8 @@ def spread_pulse(position: Array, sigma: Array) -> tuple[IndexArray, Array]:
 
 
 def bin_by_time(
-    pixel: IndexArray, position: Array, light: Array, sigma: float, shape: tuple[int, int]
-) -> Array:
+    pixel: IndexArray, position: AnyArray, light: AnyArray, sigma: float, shape: tuple[int, int]
+) -> AnyArray:
     """Add the light of rays to the bins of their pixels, (pixels, bins), each spread over its pulse
     about its arrival, in bins; light outside of the axis is lost.
     """

@@ -29,8 +29,6 @@ from tofclip.simulate.bodies import (
 from tofclip.threads import limit_blas_threads, run_blocks
 from tofclip.units import FWHM_PER_SIGMA, SPEED_OF_LIGHT
 
-Array = AnyArray
-
 LIGHT_DIRECTION = (-0.35, -0.45, -0.82)  # towards the lamp: over the viewer's left shoulder
 
 
@@ -132,7 +130,7 @@ class RenderedLightField:
     light_field: LightField
     # (rows, columns) float32, of what the reference view (0, 0) sees in the middle of each pixel;
     # infinite where it sees nothing
-    shears: Array
+    shears: AnyArray
 
 
 def render_light_field(scene: Scene, array: CameraArray) -> RenderedLightField:
@@ -145,7 +143,9 @@ def render_light_field(scene: Scene, array: CameraArray) -> RenderedLightField:
     return RenderedLightField(LightField(pictures, views), render_shear_map(scene, array))
 
 
-def _for_each_view(array: CameraArray, pictures: Array, render: Callable[[View], Array]) -> None:
+def _for_each_view(
+    array: CameraArray, pictures: AnyArray, render: Callable[[View], AnyArray]
+) -> None:
     """Fill `pictures` (views, ...); the threads are used for views."""
 
     def fill(piece: slice) -> None:
@@ -157,7 +157,7 @@ def _for_each_view(array: CameraArray, pictures: Array, render: Callable[[View],
         run_blocks(fill, len(pictures), 1)
 
 
-def render_view(scene: Scene, array: CameraArray, view: View) -> Array:
+def render_view(scene: Scene, array: CameraArray, view: View) -> AnyArray:
     """Return what the camera at (v, u) sees, (rows, columns) float32; fractions are cameras between
     the array's.
     """
@@ -168,7 +168,7 @@ def render_view(scene: Scene, array: CameraArray, view: View) -> Array:
     return by_pixel.mean(axis=(1, 3)).astype(np.float32)
 
 
-def render_shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) -> Array:
+def render_shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) -> AnyArray:
     """Return the shear of what a view sees in the middle of each pixel, (rows, columns) float32,
     pixels per view step; infinite where it sees nothing.
     """
@@ -179,7 +179,7 @@ def render_shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) 
     return np.where(seen, array.shear(depth), np.inf).reshape(array.image_shape).astype(np.float32)
 
 
-def _shade_rays(scene: Scene, origin: Array, directions: Array) -> tuple[Array, Array]:
+def _shade_rays(scene: Scene, origin: AnyArray, directions: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Distance to the nearest surface along each ray and the light that comes back from it."""
     sight = cast_rays(scene.bodies, origin, directions)
     brightness = np.zeros(len(directions))
@@ -251,7 +251,7 @@ def render_flash(scene: PulsedScene, array: CameraArray, time_axis: TimeAxis) ->
 
 def render_flash_view(
     scene: PulsedScene, array: CameraArray, time_axis: TimeAxis, view: View
-) -> Array:
+) -> AnyArray:
     """Return what the camera at (v, u) sees in every time bin, (rows, columns, bins) float32."""
     origin, directions = array.rays(view, array.samples)
     sight = cast_rays(scene.bodies, origin, directions)

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from tofclip.compiling import compile_as_part, compile_loop
+from tofclip.compiling import SUMS_AS_WRITTEN, compile_as_part, compile_loop
 from tofclip.operators.kernels import (
     WIDE_LANES,
     multiply_sparse_rows,
@@ -26,11 +26,10 @@ TILE_PIXELS = 32
 STRETCH_NUMBERS = 512  # worked on together, at most: nine arrays of them are 18 kB in float32
 STRETCHES_PER_SUM = 128  # added up before they go to a sum of higher precision
 
-FASTMATH = {"contract", "nsz", "arcp", "afn"}
-fast_loop = compile_loop(fastmath=FASTMATH)
+fast_loop = compile_loop(fastmath=SUMS_AS_WRITTEN)
 # For a row: a loop over few arrays is a vector loop, because the compiler checks only a few for
 # overlap.
-row_part = compile_as_part(fastmath=FASTMATH, _nrt=False)
+row_part = compile_as_part(fastmath=SUMS_AS_WRITTEN, _nrt=False)
 
 
 @fast_loop
@@ -118,7 +117,7 @@ def copy_lanes_to_frames(block, start, frames):
                 frames[lane, pixel] = block[pixel, start + lane]
 
 
-@compile_loop(fastmath=FASTMATH, _nrt=True)
+@compile_loop(fastmath=SUMS_AS_WRITTEN, _nrt=True)
 def compute_traces(tile_starts, columns, values, rows, weights, traces, span):
     """``traces[:, span[0] : span[1]] = M[rows[0] : rows[1]] @ weights`` for a sparse matrix M in
     column tiles, see `tofclip.operators.sparse.Tiles`. `weights` (M's columns, time): rows are a
