@@ -1,6 +1,5 @@
-"""The camera model: calibration in, forward operator out.
-
-How the streak tube's sweep distorts the picture, as maps from rectified pixels to raw ones.
+"""The camera model: calibration in, forward operator out; and how the streak tube's sweep distorts the
+picture, as maps from rectified pixels to raw ones.
 
 A *rectified* streak image has one row per instant, the same for all columns; its columns are the
 slit's. A sweep says where in the *raw* image each rectified pixel lies, so that the raw image is

@@ -4,13 +4,6 @@
 Every function is serial and holds no interpreter lock; pixels are shared between threads. Loops over
 bins take a vector of them at a time (`tofclip.vectors`): axes are a whole number of vectors long
 (`tofclip.lidar.trace_search`).
-
-Which candidates of a pixel are one surface, whose light the recovery spread over time.
-
-The views are projections along lines within some angle of the vertical. Where a surface's lines of
-equal range run level in the picture, as a table top's or a slanted roof's do, light of an instant can
-move up and down along them without a view that notices. At one pixel the pulse becomes a hump, many
-pulses long, on which each ripple looks like a return: none is, and their middle is.
 """
 
 from __future__ import annotations
@@ -450,6 +443,12 @@ def pool_significance(pixel, distance, own, starts, image_shape, limits, pooled)
                         total += own[k]
         pooled[number] = total
 
+
+# Which candidates of a pixel are one surface, whose light the recovery spread over time. The views are
+# projections along lines within some angle of the vertical. Where a surface's lines of equal range run
+# level in the picture, as a table top's or a slanted roof's do, light of an instant can move up and down
+# along them without a view that notices. At one pixel the pulse becomes a hump, many pulses long, on
+# which each ripple looks like a return: none is, and their middle is.
 
 spread_part = compile_as_part(_nrt=False)
 

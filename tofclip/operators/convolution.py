@@ -1,10 +1,6 @@
 """Convolution of a picture with a point-spread function: what a lens, a mask or a diffuser puts on
-a sensor.
-
-A 1D sensor behind point-spread functions (supplement Note 4), and coded lines as such functions.
-
-Point-spread functions: of masks and phase plates in the aperture, traced with rays, and measured
-ones.
+a sensor, of one line too (supplement Note 4); and the point-spread functions: coded lines, those of
+masks and phase plates in the aperture, traced with rays, and measured ones.
 
 A ray through view (v, u) from a point at shear s meets the sensor at ``s (v, u)`` plus what the
 element in the aperture deflects it by. The rays of one view make that view's PSF ``r(x, -u)``; all

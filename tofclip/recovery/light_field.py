@@ -1,7 +1,5 @@
 """From the measurements of a light-field camera to the picture at one depth, by names that a user
-can type.
-
-A picture that is sharp at all depths, and the depths, from one shot of a light-field camera.
+can type, and to a picture that is sharp at all depths, and the depths.
 
 Refocusing explains the measurements by one picture at one depth, and everything else blurs it. Here
 each pixel lies at a shear of its own (`tofclip.light_field.views`), so that one picture h explains all

@@ -1,8 +1,5 @@
-"""Shot after shot to cloud after cloud, with what does not change from shot to shot worked out
-once.
-
-Shot after shot, each beginning at what the last one showed: pictures of a method with a prior, or
-surfaces.
+"""Shot after shot to cloud after cloud: what does not change from shot to shot is worked out once, and
+pictures of a method with a prior, or surfaces, begin at what the last shot showed.
 
 From one shot to the next little changes but the noise. Iterations that begin at the last shot's
 pictures need a few steps where those that begin in darkness need forty.
