@@ -150,9 +150,3 @@ def test_transforms_load_neither_dask_nor_pandas():
         "assert plans.pyfftw is not None; assert not {'dask', 'pandas'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-# --- depths that are interpolated instead of computed
-
-
-# --- progress of several steps

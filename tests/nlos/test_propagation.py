@@ -182,6 +182,3 @@ def test_scattered_points_take_it_where_it_is_faster_and_installed(
         errors[faster, installed] = relative_error(propagate(capture, FINE, PULSE).values, exact)
     assert 1e-5 < errors[True, True] < 1e-2
     assert errors[True, False] == errors[False, True] == 0
-
-
-# --- the virtual plane

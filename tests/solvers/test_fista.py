@@ -177,35 +177,6 @@ def test_tolerance_stops_and_says_so():
     assert done.objective[-1] < limited.objective[-1]
 
 
-def test_after_a_refused_step_the_momentum_starts_anew():
-    """The first step from there is a plain one, the second has the second momentum of all runs, and
-    both the size that the solver says.
-    """
-    operator, measurements, checked = projection(), noise(3, LANES), 0
-    solver = begin(LeastSquares(measurements), NonnegativeSparsity(1e-3))
-    for _ in range(200):
-        solver.step()
-        fresh = solver.rejected.copy()
-        age, size_before = np.ones(LANES), solver.step_sizes
-        for number in range(2):
-            if not fresh.any():
-                break
-            size = solver.step_sizes
-            # the first step's momentum is 0; the next one's follows the ratio of the steps
-            older, age = age, (1 + np.sqrt(1 + 4 * size_before / size * age**2)) / 2
-            momentum = (older - 1) / age
-            ahead = solver.current + momentum * (solver.current - solver.previous)
-            gradient = operator.adjoint(operator(ahead) - measurements)
-            expected = np.maximum(ahead - size * (gradient + 1e-3), 0)
-            size_before = size
-            solver.step()
-            fresh &= ~solver.rejected
-            difference = np.abs(solver.current - expected)[..., fresh]
-            assert np.all(difference <= 1e-9 * np.abs(expected).max())
-            checked += np.count_nonzero(fresh) if number else 0
-    assert checked > 0
-
-
 def test_steps_grow_as_far_as_they_are_safe_and_save_iterations():
     """Two thirds of the iterations of steps of one size lead to the same objective."""
     measurements = projection()(PICTURE)
