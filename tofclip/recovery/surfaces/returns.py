@@ -32,13 +32,12 @@ from tofclip.units import SPEED_OF_LIGHT
 
 # Logarithm of the odds that a surface's point is false: nothing known, for each e-fold of the deviations
 # by which it is out of the noise, where the frames have returns beside all points about it, for each
-# e-fold of the part of its surface's light that may as well lie elsewhere, and for each by which its
-# place is then as bright as the brightest beside it, times that part, and where something lies before
-# it. From scenes of known returns (tests/lidar/physics_scenes.py, apps/studies/surfaces.py); docs tell
-# what they miss.
-FALSE_ODDS = np.array([6.44, -1.10, -3.82, 2.03, -7.79, 0.79])
+# e-fold of the part of its surface's light that may as well lie elsewhere, of the number of the surface's
+# points, and of its place's brightness beside the brightest, times the part of the light that may as well
+# lie elsewhere. From scenes of known returns (tests/lidar/physics_scenes.py); docs tell what they miss.
+FALSE_ODDS = np.array([11.39, -0.52, -4.27, 2.41, -0.82, -4.57])
 # Less, and of light elsewhere more, makes no difference.
-LEAST_ELSEWHERE, MOST_ELSEWHERE, LEAST_BRIGHT = 0.07, 0.5, 0.01
+LEAST_ELSEWHERE, MOST_ELSEWHERE, LEAST_PART, LEAST_BRIGHT = 0.07, 0.5, 0.02, 0.01
 ABOUT_PX = 5  # side of the square
 
 # Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
@@ -137,6 +136,7 @@ def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]
     variance = solver.estimate_local_variance()
     significance = solver.measure_significance(variance)
     shown = find_candidates(solver, significance, limit)
+    surface = model.surface[shown]
     # Light of a line of one range may lie anywhere in a lens about it: of such a surface the two
     # explanations are unlike where they are as probable: a recorded shot, which neither explains to the
     # noise, lost a third of its points otherwise. Light that stays near on another surface counts as the
@@ -144,35 +144,35 @@ def _gather_evidence(fit: SurfaceFit, limit: float) -> tuple[Pixels, FloatArray]
     sparse = copy.copy(fit.sparse)
     stays, near = _add_up_near(model, np.array([sparse.amplitude, solver.amplitude]))
     sparse.amplitude = (stays / np.maximum(near, TINY) * solver.amplitude).astype(np.float32)
-    bright, brightest = sparse.compare_places()
+    places = np.array([one.compare_places() for one in (solver, sparse)])
     light, sparsely = (model.render(one.amplitude) for one in (solver, fit.sparse))
     change = (model.image - sparsely) ** 2 - (model.image - light) ** 2
     change *= model.weights / variance
     place = partial(scipy.ndimage.uniform_filter, size=NEIGHBOURHOOD_PX, mode="constant")
     worse = solver.map_pictures(place, share_misfit(model, solver.amplitude, light, change))
-    moved = np.maximum(solver.compare_places()[0] - bright, 0)
+    (bright, narrow), brightest = places[:, 0], places[:, 1]
+    moved = np.maximum(bright - narrow, 0)
+    here, around = (solver.map_pictures(place, one)[shown] for one in (moved, bright))
     moved *= np.exp(-(NEIGHBOURHOOD_PX**2) * np.maximum(worse, 0) / 2)
     lost, whole = (
         np.bincount(model.surface, one, len(model.parts)) for one in (moved, solver.amplitude)
     )
     elsewhere = np.clip(lost / np.maximum(whole, TINY), LEAST_ELSEWHERE, MOST_ELSEWHERE)
-    elsewhere = elsewhere[model.surface[shown]]
+    elsewhere, size = elsewhere[surface], np.bincount(surface)[surface]
+    part = (elsewhere + np.clip(here / np.maximum(around, TINY), LEAST_PART, 1)) / 2
+    dim = np.log(np.maximum(places[:, 0] / np.maximum(brightest, TINY), LEAST_BRIGHT))
 
     points = model.row[shown], model.column[shown], model.distance[shown]
     candidates, confirmed = shown.astype(np.float64), np.zeros(shown.size)
     confirmed[shown] = find_near(points, (seen.y, seen.x, seen.range), model.row_m)
     mean = partial(scipy.ndimage.uniform_filter, size=ABOUT_PX, mode="constant")
     about, near = (solver.map_pictures(mean, one)[shown] for one in (confirmed, candidates))
-    nearest, pixel = np.full(model.masks[0].size, np.inf), model.pixel[shown]
-    np.minimum.at(nearest, pixel, model.distance[shown])
-    behind = model.distance[shown] > nearest[pixel] + NEAR_BINS * model.row_m
-    dim = np.log(np.maximum(bright / np.maximum(brightest, TINY), LEAST_BRIGHT))[shown]
     known = [
         np.log(significance[shown]),
         about / near,
         np.log(elsewhere),
-        elsewhere * dim,
-        behind,
+        np.log(size),
+        part * dim.sum(axis=0)[shown],
     ]
     return np.flatnonzero(shown), np.array(known)
 
