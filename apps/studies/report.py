@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from apps.figures.style import (
     DEPTH_COLOURMAP,
     SMALL_FONT_PT,
+    add_colour_bar,
     draw_image,
     make_figure,
     store_picture,
@@ -233,9 +234,9 @@ def make_reproduction_figure(title: str, outcome: Outcome) -> Figure:
             place.set_axis_off()
         for place, panel in zip(row, line, strict=False):
             if panel.is_map:
-                draw_image(
-                    place, panel.picture, cmap=DEPTH_COLOURMAP, vmin=MIN_SHEAR, vmax=MAX_SHEAR
-                )
+                look: Any = {"cmap": DEPTH_COLOURMAP, "vmin": MIN_SHEAR, "vmax": MAX_SHEAR}
+                drawn = draw_image(place, panel.picture, **look)
+                add_colour_bar(place, drawn, "s (px per view)")
             else:
                 brightest = np.percentile(panel.picture, WHITE_PERCENTILE) or 1.0
                 draw_image(place, panel.picture, cmap="gray", vmin=0, vmax=brightest)

@@ -322,11 +322,25 @@ def plugins(
         return
     width = max(len(one["name"]) for one in shown)
     for one in shown:
-        text = one["fault"] or (one["meaning"] if name else one["meaning"][:TEXT_WIDTH])
+        text = one["fault"] or (one["meaning"] if name else shorten(one["meaning"]))
         print(f"{one['group']:<18}{one['name']:<{width}}  {one['origin']:<12}  {text}")
         for setting in one["settings"] if name else ():
             lead = "?" if one["group"] == "tofclip.sources" else "--set "
             print(f"    {lead}{setting['name']}={setting['default']}")
+
+
+def shorten(text: str) -> str:
+    """Cut a text where a word, or a value of an address, ends.
+
+    Examples
+    --------
+    >>> shorten("Half-quadratic splitting with a denoiser in the place of the prior's proximal map.")
+    "Half-quadratic splitting with a denoiser in the place of the ..."
+    """
+    if len(text) <= TEXT_WIDTH:
+        return text
+    found = re.match(rf".{{,{TEXT_WIDTH - 4}}}(?=[ &?])", text)
+    return f"{found[0] if found else text[: TEXT_WIDTH - 4]} ..."
 
 
 def list_parts() -> Iterator[dict[str, Any]]:
