@@ -186,7 +186,6 @@ class _Setting:
         return float(f"{value / self.factor:.15g}") if changes else value
 
     def read(self, value: Any) -> Any:
-        """Return a value in SI units."""
         return value * self.factor if value is not None and self.factor != 1 else value
 
     def make_flag(self) -> inspect.Parameter:

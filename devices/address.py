@@ -28,7 +28,6 @@ class Uri:
 
     @classmethod
     def parse(cls, text: str) -> Uri:
-        """Take an address apart."""
         if not text.isprintable():
             raise InputError(f"{text!r} holds control characters, which no address has")
         scheme, separator, rest = text.partition("://")
@@ -128,7 +127,6 @@ class Options:
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """Return the names of all values."""
         return tuple(one.name for one in cls.declared())
 
     @classmethod

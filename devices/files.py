@@ -87,7 +87,6 @@ class RecordFile(Source):
         return self._ledger.stats
 
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
-        """Return the next batch at once; `timeout` does not matter."""
         first = self._next
         if self._closed or first == self._begins[-1]:
             return None
@@ -126,11 +125,9 @@ class WholeRecords:
 
     @property
     def sizes(self) -> list[int]:
-        """Records of the one piece."""
         return [len(self.records)]
 
     def decode(self, piece: int) -> Records:
-        """Return all of them."""
         return self.records
 
 
@@ -159,7 +156,6 @@ class PtuPhotons:
         self.info = Info(f"TCSPC file ({events.kind})", "", self.calibration.attributes)
 
     def decode(self, piece: int) -> Records:
-        """Return the photons of a million events."""
         found = self._events.decode(piece, self._checkpoints[piece])[0]
         columns = (found.pulse, found.delay, found.channel)
         return _make_photons(*(column[found.is_photon] for column in columns))
@@ -200,7 +196,6 @@ class SwabianPhotons:
         self.info = Info("time tags (Swabian Instruments)", "", details)
 
     def decode(self, piece: int) -> Records:
-        """Return the photons of a million tags."""
         if piece < self._next:
             self._rewind()
         while True:

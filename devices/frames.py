@@ -37,7 +37,6 @@ class GatedOptions(LiveOptions):
 
     @property
     def is_gated(self) -> bool:
-        """Whether there is a gate."""
         return self.mode == "gated"
 
     @property
@@ -123,7 +122,6 @@ class FrameCodec(Codec):
 
     @property
     def settings(self) -> Mapping[str, Scalar]:
-        """Arguments that build this codec again."""
         shape = {"rows": self.rows, "columns": self.columns, "bits": self.bits}
         return {**shape, "quarter_turns": self.quarter_turns} if self.quarter_turns else shape
 
@@ -134,7 +132,6 @@ class FrameCodec(Codec):
 
     @property
     def unit_bytes(self) -> int:
-        """Bytes of a picture and its number."""
         return _NUMBER_DTYPE.itemsize + self.pixel_bytes
 
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
@@ -157,7 +154,6 @@ class FrameCodec(Codec):
         return DecodeResult(records, len(numbers) - len(records), int(before[-1]))
 
     def encode(self, records: Records) -> bytes:
-        """Return numbers and pixels as the camera sends them."""
         self._require_records(records)
         numbers, counts = np.ascontiguousarray(records["number"]), records["counts"]
         if np.any(np.diff(numbers, prepend=-1) <= 0):
@@ -203,7 +199,6 @@ class FrameFeed(Feed):
             self._note_gap()
 
     def _reconnect(self, connect: Callable[[], object], seconds: float) -> None:
-        """Try until the instrument is back."""
         retry_connect(connect, seconds)
         self.ledger.reconnect()
         self._gap = Gap.RESTART

@@ -64,7 +64,6 @@ class BinAxis:
 
     @property
     def period_bins(self) -> float:
-        """Bins in the laser's period, 0 for none."""
         return 0.0 if self.period is None else self.period / self.bin_width
 
 

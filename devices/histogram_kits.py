@@ -143,7 +143,6 @@ class Vl53l8Parser:
         self._next = 0
 
     def parse_line(self, line: bytes) -> KitFrame | None:
-        """Take the next line; return the frame that it completes, if it does."""
         if not line.startswith(b"Aggregate "):
             return None
         head, _, tail = line.partition(b"Bins:")
@@ -206,7 +205,6 @@ class Tmf8828Options(LiveOptions):
 
     @property
     def bin_width(self) -> float:
-        """Duration of a bin, s."""
         return self.bin_ps * PICOSECOND
 
 
@@ -227,12 +225,10 @@ class Vl53l8Options(LiveOptions):
 
     @property
     def bin_width(self) -> float:
-        """Duration of a bin, s."""
         return self.sub_sample * VL53_NATIVE_BIN_S
 
     @property
     def begin(self) -> float:
-        """Begin of the first bin, s."""
         return self.start_bin * VL53_NATIVE_BIN_S
 
 

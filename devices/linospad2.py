@@ -96,7 +96,6 @@ class LinoSpad2Codec(Codec):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Type of a time stamp."""
         return STAMP_WITH_COUNTER_DTYPE if self.counter else STAMP_DTYPE
 
     @property
@@ -106,12 +105,10 @@ class LinoSpad2Codec(Codec):
 
     @property
     def cycle_words(self) -> int:
-        """Words of a cycle."""
         return self.header + CONVERTERS * self.timestamps
 
     @property
     def unit_bytes(self) -> int:
-        """Bytes of a cycle."""
         return self.cycle_words * _WORD_DTYPE.itemsize
 
     @cached_property
@@ -129,7 +126,6 @@ class LinoSpad2Codec(Codec):
         return np.argsort(self.pixel_of, axis=None).astype(np.uint32)
 
     def count_records(self, data: ByteView) -> int:
-        """Return how many words of `data` are valid."""
         return sum(self.count_stamps(data))
 
     def count_stamps(self, data: ByteView) -> tuple[int, int]:
@@ -340,12 +336,10 @@ class Sidecar:
 
     @property
     def codec(self) -> LinoSpad2Codec:
-        """What reads the recording."""
         return LinoSpad2Codec(self.firmware, self.timestamps_per_cycle, self.absolute_counter)
 
     @property
     def laser_period(self) -> float | None:
-        """Time between two pulses, s."""
         return self.laser_period_ps * 1e-12 or None
 
     @cached_property

@@ -95,7 +95,6 @@ class Command:
     arguments: tuple[str, ...] = ()
 
     def encode(self) -> bytes:
-        """Return the bytes to send."""
         return _encode_text(str(self), self)
 
     @classmethod
@@ -122,11 +121,9 @@ class Answer:
 
     @property
     def is_message(self) -> bool:
-        """Whether it came unasked."""
         return self.code in (AnswerCode.MESSAGE, AnswerCode.NOTICE)
 
     def encode(self) -> bytes:
-        """Return the bytes to send."""
         return _encode_text(",".join([str(int(self.code)), self.name, *self.arguments]), self)
 
     @classmethod
@@ -289,7 +286,6 @@ class RemoteExClient:
         return np.frombuffer(self._read_data(length, MAX_TABLE_BYTES), "<f4")
 
     def close(self) -> None:
-        """Close both connections; closing twice is fine."""
         self._commands.close()
         self._data.close()
 

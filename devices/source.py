@@ -160,7 +160,6 @@ class Stats:
         return self.acquired == known + self.malformed
 
     def as_dict(self) -> dict[str, int]:
-        """Return the accounts by name."""
         return asdict(self)
 
 
@@ -354,7 +353,6 @@ class Info:
     details: Mapping[str, Scalar] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Scalar]:
-        """Return everything in one mapping."""
         return {"instrument": self.instrument, "serial": self.serial, **self.details}
 
 
@@ -540,7 +538,6 @@ class SeekableSource(DecodedSource):
         """Return a piece, by its number from 0."""
 
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
-        """Return the next batch at once; `timeout` does not matter."""
         if self._next >= self._pieces:
             return None
         batch = self._decode_next()

@@ -87,7 +87,6 @@ class SpadOptions(GatedOptions):
 
     @property
     def seconds(self) -> float:
-        """Integration time of a picture, s."""
         return self.exposure_us * 1e-6
 
     @property
@@ -103,7 +102,6 @@ class SpadOptions(GatedOptions):
         return FrameCodec(ROWS, self.width, 16 if self.bits > 8 or self.pile_up else 8)
 
     def encode(self) -> bytes:
-        """Return the command that asks for the pictures."""
         amount = f"{self.bits},{self.exposure_us / _find_time_unit_us(self.bits):.9g},{self.images}"
         if not self.is_gated:
             return f"I,{amount},0,1,0,1,{self.width}".encode()

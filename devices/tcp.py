@@ -41,7 +41,6 @@ class TcpLink(Closing):
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, data: bytes, timeout: float) -> None:
-        """Send all of `data`."""
         with self._translate_errors():
             self._socket.settimeout(timeout)
             self._socket.sendall(data)

@@ -107,7 +107,6 @@ class TimeTagger:
         return self._transact(_READ, register, 0)
 
     def write(self, register: Register, value: int) -> None:
-        """Set a register."""
         self._transact(_WRITE, register, value)
 
     def reset(self) -> None:
@@ -231,7 +230,6 @@ class TimeTagOptions(LiveOptions):
 
     @property
     def transfer_bytes(self) -> int:
-        """Bytes that one transfer asks for."""
         return int(self.transfer_kib * 1024)
 
 

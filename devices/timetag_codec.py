@@ -75,7 +75,6 @@ class TimeTagCodec(Codec):
         return DecodeResult(records[:kept], len(records) - kept, CounterState(*position))
 
     def encode(self, records: Records) -> bytes:
-        """Return the bytes that the instrument would have sent."""
         self._require_records(records)
         _require_valid(records)
         return pack_words(records).tobytes()

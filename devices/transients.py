@@ -122,7 +122,6 @@ class Accumulation(Options):
         return self.frames * self.scans
 
     def axis(self, known_period: float | None) -> BinAxis:
-        """Return the bins of a histogram of photons."""
         width = BIN_WIDTH_S if self.bin_width is None else self.bin_width
         start = self.start_ps * PICOSECOND
         period = self.period_ps * PICOSECOND if self.period_ps else known_period
@@ -432,7 +431,6 @@ class TransientStream(Iterator[LiveShot]):
 
     @property
     def stats(self) -> Stats:
-        """Where every record went; see `Source.stats`."""
         return Stats() if self._source is None else self._source.stats
 
     @property
@@ -449,7 +447,6 @@ class TransientStream(Iterator[LiveShot]):
         return next(self._shots)
 
     def close(self) -> None:
-        """Close the source."""
         self._shots.close()
 
     def _read(self) -> Generator[LiveShot]:

@@ -137,7 +137,6 @@ class UsbLink:
         )
 
     def write(self, endpoint: int, data: bytes, timeout: float) -> None:
-        """Send all of `data` to a bulk endpoint."""
         sent = self._retry_after_halt(
             endpoint, lambda: int(self._device.write(endpoint, data, _to_milliseconds(timeout)))
         )

@@ -74,7 +74,6 @@ class Case:
 
     @property
     def group(self) -> str:
-        """The first word of the name."""
         return self.name.partition("-")[0]
 
 

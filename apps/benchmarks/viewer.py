@@ -68,7 +68,6 @@ class WholeDetail(DetailChooser):
     """Draws all points, however slow that is."""
 
     def count(self, points: int, moving: bool) -> int:
-        """Return all of them."""
         return points
 
 

@@ -247,7 +247,6 @@ class FilmWriter:
         self._writer.write(pixels[..., ::-1])
 
     def close(self) -> None:
-        """Write what is left."""
         if self._writer is not None:
             self._writer.release()
 

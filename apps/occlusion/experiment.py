@@ -178,7 +178,6 @@ class Experiment:
 
     @cached_property
     def separated(self) -> SeparatedImages:
-        """Occluder and target from the measurements."""
         return separate_occluder(self.measurements)
 
     @cached_property
@@ -435,7 +434,6 @@ class ProbeResult:
 
     @property
     def is_recovered(self) -> bool:
-        """Whether it was."""
         return self.correlation >= MIN_CORRELATION
 
 

@@ -65,7 +65,6 @@ class Row:
 
     @property
     def mean(self) -> float:
-        """Mean over the seeds."""
         return float(np.mean(self.ours))
 
     @property
@@ -151,11 +150,9 @@ class Library:
         return render_view(remove_occluder(make_scene(name, self.array)), self.array, (0.0, 0.0))
 
     def has_recording(self, name: str) -> bool:
-        """Return whether the folder of recorded data holds a file."""
         return self.data is not None and (self.data / name).is_file()
 
     def recording(self, name: str) -> Path:
-        """Return the path of a file of the folder of recorded data."""
         if self.data is None:
             raise InputError(f"{name} is recorded data; name the folder that holds it by --data")
         return self.data / name
@@ -230,7 +227,6 @@ class SolvedCase:
     weight: float  # of the first seed's prior
 
     def row(self) -> Row:
-        """Return the row of the table."""
         return Row(self.case.labels, self.percent, self.case.paper)
 
     def panel(self, title: str) -> Panel:

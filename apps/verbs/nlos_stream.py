@@ -237,7 +237,6 @@ class VolumeStream:
         self.ended, self.stopping = threading.Event(), threading.Event()
 
     def run(self) -> dict[str, Any]:
-        """Image all that comes; return the figures."""
         from concurrent.futures import ThreadPoolExecutor
 
         from tofclip.sequences.streaming import run_in_order

@@ -500,7 +500,6 @@ class _Tally:
             self._seconds = time.perf_counter() - started
 
     def list_figures(self) -> dict[str, Any]:
-        """What is reported at the end."""
         known = {name: compute_quantiles(seconds) for name, seconds in self._times.items()}
         ages, latency = known.pop("age"), known.pop("all")
         return {

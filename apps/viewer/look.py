@@ -105,7 +105,6 @@ class Scale:
 
     @property
     def limits(self) -> Limits:
-        """Values of the first and the last colour."""
         return self.values[0], self.values[-1]
 
     @property
@@ -116,7 +115,6 @@ class Scale:
 
     @property
     def title(self) -> str:
-        """Quantity and unit, as they are written."""
         unit = "mm" if self.factor > 1 else self.unit
         return f"{self.quantity} ({unit})" if unit else self.quantity
 
@@ -221,7 +219,6 @@ class Pick:
 
     @property
     def position(self) -> Float32Array:
-        """x, y, z in m."""
         return self.point.xyz[0]
 
     @property

@@ -304,7 +304,6 @@ class Page:
             self._woken.wait(TICK_S)
 
     def close(self) -> None:
-        """Stop serving."""
         self._stopping.set()
         self._woken.set()
         stop_server(self.server)
@@ -412,7 +411,6 @@ class PageDoor:
             say_waiting(self._waiting[0], words)
 
     def serve(self, session: Session) -> None:
-        """Serve a session until Ctrl-C."""
         page = Page(session, self.port, parse_host(self.host), self._waiting)
         was_waiting, self._waiting = self._waiting is not None, None
         with contextlib.closing(page):

@@ -162,7 +162,6 @@ class Controls:
 
     @property
     def point_size(self) -> float:
-        """Side of a point, m."""
         return float(self._size.value) / 1e3
 
     def show(self, shown: DisplayedFrame, status: str) -> None:
@@ -189,7 +188,6 @@ class Controls:
         bind_user_input(handle, self._post, act)
 
     def _add_setting(self, setting: Setting | Choice) -> None:
-        """Add the control of what a source lets one set."""
         gui: Any = self._gui
         handle: Any
 
@@ -301,7 +299,6 @@ class Controls:
         gui.add_button("reset filters").on_click(lambda _: self._post(reset))
 
     def _take_clip_box(self, box: Box) -> None:
-        """Filter by a box that was dragged."""
         for axis, low, high in zip("xyz", box.low.tolist(), box.high.tolist(), strict=True):
             self._session.filters = self._session.filters.limit(axis, (low, high))
 
@@ -357,7 +354,6 @@ class Controls:
             show_plane(True)
 
     def _take_section(self) -> None:
-        """Show what lies about the plane."""
         section = self._plane.find_section(self._thickness.value / 1e3)
         self._session.filters = replace(self._session.filters, section=section)
 

@@ -52,16 +52,13 @@ class FramePacer:
     _sent: deque[float] = field(default_factory=deque)
 
     def record_sent(self, now: float, points: int) -> None:
-        """Note that a frame was sent at time `now`, s."""
         self._next = now + max(1 / MAX_FRAMES_PER_S, points / MAX_POINTS_PER_S)
         self._sent.append(now)
 
     def can_send(self, now: float) -> bool:
-        """Whether the next frame can go at time `now`, s."""
         return now >= self._next
 
     def per_second(self, now: float) -> float:
-        """Return how many there were each second."""
         while self._sent and self._sent[0] < now - RATE_WINDOW_S:
             self._sent.popleft()
         return len(self._sent) / RATE_WINDOW_S
@@ -140,7 +137,6 @@ class Points:
         self._server.flush()
 
     def resize(self, size_m: float) -> None:
-        """Give points another size, m."""
         self._size_m = size_m
         if self._opacities is not None:
             self._still = self._add("/points", self.drawn)
@@ -200,7 +196,6 @@ class Points:
             self._moving.visible = False
 
     def _add(self, name: str, count: int) -> Any:
-        """Put some of the points into the scene."""
         xyz, colours = self._xyz, self._colours
         if self._order is not None and count < len(xyz):
             part = self._order[:count]
@@ -326,7 +321,6 @@ class ClipBox:
         return bool(self._handles)
 
     def show(self, box: Box) -> None:
-        """Draw the box with its handles."""
         self.hide()
         self._draw_edges(box)
         look: Any = {"disable_rotations": True, "disable_sliders": True, "depth_test": False}
@@ -339,7 +333,6 @@ class ClipBox:
             self._handles.append(handle)
 
     def hide(self) -> None:
-        """Take the box and its handles away."""
         if self._handles:
             for node in (self._edges, *self._handles):
                 node.remove()
@@ -379,7 +372,6 @@ class SectionPlane:
         self._handle.on_update(lambda _: self._changed())
 
     def hide(self) -> None:
-        """Take the plane away."""
         if self._handle is not None:
             self._handle.remove()
         self._handle = None

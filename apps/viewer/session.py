@@ -46,7 +46,6 @@ class PlaybackClock:
 
     @property
     def frame(self) -> int:
-        """The frame that is due."""
         return int(self.position)
 
     def play(self) -> None:
@@ -57,7 +56,6 @@ class PlaybackClock:
         self.following, self.playing, self._last_tick_s = False, True, None
 
     def pause(self) -> None:
-        """Stand still."""
         self.following = self.playing = False
 
     def follow(self) -> None:
@@ -116,7 +114,6 @@ class Filters:
                 raise InputError(f"the limits of {name} must rise, got {low:g} and {high:g}")
 
     def limit(self, name: str, limits: Limits) -> Filters:
-        """Return filters with other limits of a quantity."""
         return replace(self, limits={**self.limits, name: limits})
 
     def select(self, view: View) -> BoolArray:
@@ -214,7 +211,6 @@ class Session:
 
     @property
     def distance(self) -> float | None:
-        """Distance of the last two picks, m."""
         if len(self.picks) < 2:
             return None
         first, second = (pick.position for pick in self.picks)

@@ -52,7 +52,6 @@ class StoredShots:
         return len(self._shots)
 
     def get(self, number: int) -> TakenShot:
-        """Return shot `number`."""
         return self._read(number)
 
     def close(self) -> None:
@@ -96,14 +95,12 @@ class LiveShots:
 
     @property
     def inflow(self) -> Inflow:
-        """What comes in, and how fast."""
         arrivals, rate = [*self._arrivals], 0.0
         if len(arrivals) > 1 and self._inflow.is_live:
             rate = (len(arrivals) - 1) / max(arrivals[-1] - arrivals[0], 1e-9)
         return replace(self._inflow, oldest=self._kept.oldest, data_rate=rate)
 
     def close(self) -> None:
-        """Let go of the instrument."""
         self._stopping.set()
         self._thread.join(STOP_TIMEOUT_S)
 

@@ -108,7 +108,6 @@ class KeptFrames(Generic[Frame]):
 
     @property
     def oldest(self) -> int:
-        """Number of the first that is still there."""
         return self._count - len(self._frames)
 
     def append(self, frame: Frame, most: int) -> None:

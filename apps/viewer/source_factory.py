@@ -72,12 +72,10 @@ class ShotOptions:
     method: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return them as JSON takes them."""
         return {**asdict(self), "camera": self.camera and str(self.camera.resolve())}
 
     @classmethod
     def from_dict(cls, known: dict[str, Any]) -> ShotOptions:
-        """Return what `to_dict` was made of."""
         given: dict[str, Any] = {one.name: known.get(one.name) for one in fields(cls)}
         return cls(**{**given, "camera": given["camera"] and Path(given["camera"])})
 

@@ -254,7 +254,6 @@ class RecoveredSource(Source):
 
     @property
     def method(self) -> Method:
-        """The method that is chosen."""
         name = self.method_choice.value
         if name not in METHODS or name in UNFOCUSED:
             name = LOOK_METHOD
@@ -262,7 +261,6 @@ class RecoveredSource(Source):
 
     @property
     def method_notes(self) -> tuple[str, ...]:
-        """What has to be known about the method that is chosen."""
         return (LINEAR_NOTE,) if self.method_choice.value == LinearInverse.name else ()
 
     @abc.abstractmethod
@@ -285,7 +283,6 @@ class RecoveredSource(Source):
         )
 
     def recover_frames(self, number: int) -> Frames:
-        """Return all frames of shot `number`."""
         return self.recover(number)
 
     def waveform(
@@ -296,7 +293,6 @@ class RecoveredSource(Source):
         return np.stack([frames.times, frames.values[:, row, column]])
 
     def recover_near(self, number: int, near: slice) -> Frames:
-        """Return some frames of shot `number`."""
         return self.recover(number, part=near)
 
 

@@ -81,7 +81,6 @@ class Box:
 
     @property
     def middle(self) -> FloatArray:
-        """(3,), m."""
         return (self.low + self.high) / 2
 
     @property

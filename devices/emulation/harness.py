@@ -142,7 +142,6 @@ class LoopbackServer(socketserver.ThreadingTCPServer):
             hang_up(self._links.pop())
 
     def close(self) -> None:
-        """Stop serving; closing twice is fine."""
         self.shutdown()
         self.server_close()
         self.close_connections()

@@ -129,7 +129,6 @@ class EmulatedKit:
         return np.random.default_rng([options.seed, number]).poisson(light).astype(np.uint32)
 
     def close(self) -> None:
-        """Unplug it."""
         self._closing.set()
         self._thread.join(2)
         for end in (self._controller, self._terminal):

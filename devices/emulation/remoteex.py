@@ -126,12 +126,10 @@ class EmulatedStreakCamera:
 
     @property
     def is_running(self) -> bool:
-        """Whether it takes pictures."""
         return self._run.is_running
 
     @property
     def gain(self) -> str:
-        """The micro-channel plate's gain, as it was set last."""
         return self._tube[GAIN_PARAMETER]
 
     @gain.setter
@@ -139,7 +137,6 @@ class EmulatedStreakCamera:
         self._tube[GAIN_PARAMETER] = value
 
     def close(self) -> None:
-        """Switch it off."""
         self._run.is_running = False
         self._command_server.close()
         self._frame_server.close()

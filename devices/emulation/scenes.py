@@ -63,7 +63,6 @@ class EmulatedLight:
 
     @classmethod
     def of(cls, light: LineLight, seed: int) -> EmulatedLight:
-        """Let a scene's light fall on the screen."""
         return cls(light.photons, light.row_times, seed=seed)
 
 

@@ -98,7 +98,6 @@ class EmulatedSpadArray:
         return counts.astype(kind).ravel().view(np.uint8)
 
     def close(self) -> None:
-        """Switch it off."""
         self._server.close()
 
     def _gate_light(self, light: FloatArray, gate: SpadOptions, number: int) -> FloatArray:

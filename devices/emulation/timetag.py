@@ -120,7 +120,6 @@ class PulsedSceneStream:
         self._words: ByteView = np.empty(0, np.uint8)
 
     def next_words(self, limit: int, last: int) -> ByteView:
-        """Return the next words, as a `PoissonStream` does."""
         taken, left = [], limit
         while left:
             if not len(self._ticks):
@@ -275,7 +274,6 @@ class EmulatedTimeTagger(VirtualDevice):
         self._segment_bytes = self._reported = 0
 
     def open_driver(self) -> StreamSource:
-        """Open the driver on it, on a USB of its own."""
         return open_on_backend(self.options, self.strings[2], VirtualUsb(self))
 
     def receive(self, endpoint: int, data: bytes) -> None:
@@ -323,7 +321,6 @@ class EmulatedTimeTagger(VirtualDevice):
         return self._send_data(buffer, timeout)
 
     def clear_halt(self, endpoint: int) -> None:
-        """End a stall, unless it is to come again."""
         if endpoint == DATA_ENDPOINT:
             self._stalls -= 1
         if endpoint != DATA_ENDPOINT or self._stalls <= 0:

@@ -44,7 +44,6 @@ class VirtualDevice(abc.ABC):
 
     @property
     def is_plugged(self) -> bool:
-        """Whether it answers."""
         return self.enumerations_until_replug <= 0
 
     def unplug(self, looks: float) -> None:
@@ -52,7 +51,6 @@ class VirtualDevice(abc.ABC):
         self.enumerations_until_replug = looks
 
     def clear_halt(self, endpoint: int) -> None:
-        """End an endpoint's stall."""
         self.halted.discard(endpoint)
 
     def control(self, request: int, value: int) -> None:
@@ -104,7 +102,6 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def get_interface_descriptor(
         self, dev: VirtualDevice, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """Describe the one interface of a device."""
         one = SimpleNamespace(
             # USB 2.0, table 9-12.
             bLength=9, bDescriptorType=4, bInterfaceNumber=INTERFACE_NUMBER, bAlternateSetting=0,
@@ -116,7 +113,6 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def get_endpoint_descriptor(
         self, dev: VirtualDevice, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
-        """Describe an endpoint of a device."""
         return SimpleNamespace(
             # USB 2.0, table 9-13.
             bLength=7, bDescriptorType=5, bEndpointAddress=dev.endpoints[ep], bmAttributes=BULK_TRANSFER,
@@ -137,22 +133,18 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         return 1
 
     def is_kernel_driver_active(self, dev_handle: VirtualDevice, intf: int) -> bool:
-        """Say that no kernel driver holds the interface."""
         _require_ready(dev_handle)
         return False
 
     def claim_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
-        """Claim the interface, which fails while another process has it."""
         _require_ready(dev_handle)
         if dev_handle.is_claimed_elsewhere:
             raise make_usb_error(errno.EBUSY)
 
     def release_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
-        """Give the interface back."""
         _require_ready(dev_handle)
 
     def clear_halt(self, dev_handle: VirtualDevice, ep: int) -> None:
-        """Let a stalled endpoint go on."""
         _require_ready(dev_handle)
         dev_handle.clear_halt(ep)
 
@@ -179,7 +171,6 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def bulk_write(
         self, dev_handle: VirtualDevice, ep: int, intf: int, data: array.array[int], timeout: int
     ) -> int:
-        """Hand what the host sends to the device."""
         _require_ready(dev_handle, ep)
         dev_handle.receive(ep, data.tobytes())
         return len(data)
@@ -187,7 +178,6 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def bulk_read(
         self, dev_handle: VirtualDevice, ep: int, intf: int, buff: array.array[int], timeout: int
     ) -> int:
-        """Have the device fill the host's buffer."""
         _require_ready(dev_handle, ep)
         return dev_handle.fill(ep, memoryview(buff), timeout / 1000)
 

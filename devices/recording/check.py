@@ -50,7 +50,6 @@ class Findings:
         return reported.delivered <= self.records and self.records + self.malformed <= most
 
     def as_dict(self) -> dict[str, object]:
-        """Return everything by name."""
         return {"sound": self.is_sound, **asdict(self)}
 
 

@@ -73,21 +73,17 @@ class Block:
 
     @property
     def is_legacy(self) -> bool:
-        """Whether version 0.1.0 wrote it."""
         return self.number < 0
 
     @property
     def payload_position(self) -> int:
-        """Position of its payload."""
         return self.position + (LEGACY_HEADER_BYTES if self.is_legacy else HEADER_BYTES)
 
     @property
     def end(self) -> int:
-        """Position behind it."""
         return self.payload_position + self.length
 
     def pack(self) -> bytes:
-        """Return the header as it lies in the file."""
         own = (self.kind, self.gap, self.time_ns, self.records, self.length, self.checksum)
         front = _LAYOUT.pack(MAGIC, self.recording, self.number, *own)
         return front + struct.pack("<I", zlib.crc32(front))
@@ -160,7 +156,6 @@ class BlockReader:
             position = found
 
     def read_payload(self, block: Block) -> bytes:
-        """Return a block's payload."""
         data = self._fetch(block.payload_position, block.length)
         if len(data) != block.length or zlib.crc32(data) != block.checksum:
             raise FileFormatError(
@@ -211,13 +206,11 @@ class Ending:
     is_complete: bool
 
     def to_json(self) -> bytes:
-        """Return the payload of an END block."""
         known = {"stats": self.stats, "fault": self.fault, "complete": self.is_complete}
         return json.dumps(known).encode()
 
     @classmethod
     def from_json(cls, payload: bytes, path: Path) -> Ending:
-        """Read the payload of an END block."""
         with guard(path, "has accounts that cannot be read"):
             known = json.loads(payload)
             stats = {str(name): int(value) for name, value in known["stats"].items()}
@@ -251,7 +244,6 @@ class Recording(Closing):
 
     @property
     def info(self) -> Info:
-        """What was known about the instrument."""
         with guard(self.path, "does not describe its instrument"):
             known = json.loads(str(self.head.attribute("info")))
             return Info(known.pop("instrument"), known.pop("serial"), known)

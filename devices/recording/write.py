@@ -79,7 +79,6 @@ class RecordingWriter:
         self._inode = os.fstat(self._file).st_ino
 
     def add(self, piece: Piece) -> None:
-        """Append a piece of the stream."""
         self._append(BlockKind.PIECE, piece.data, piece.records, piece.gap)
         self.bytes_written += len(piece.data)
         self._bytes_since_head += len(piece.data)
