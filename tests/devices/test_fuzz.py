@@ -15,6 +15,7 @@ import tracemalloc
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from unittest import mock
 
@@ -72,7 +73,8 @@ class Target:
     """Something that takes bytes from outside, with a few inputs that it likes.
 
     `slowness`: so many times fewer inputs are tried in a sample. `room`: bytes that decoding may take whatever
-    the input. `notices_all`: no damage at all is let through, as every byte has a checksum.
+    the input. `notices_all`: no damage at all is let through, as every byte has a checksum. `is_file`: what is
+    hardly the beginning of one, or something else behind it, is refused.
     """
 
     decode: Decode
@@ -80,6 +82,7 @@ class Target:
     slowness: int = 1
     room: int = 1 << 16
     notices_all: bool = False
+    is_file: bool = False
 
     def bound(self, length):
         """Bytes that decoding an input of `length` bytes may take at most."""
@@ -301,7 +304,7 @@ def file(
             writer(path)
             seeds.append(path.read_bytes())
         # The libraries' own tables and buffers, whatever the file; what it claims would be far more.
-        return Target(decode, tuple(seeds), slowness, 1 << 24, notices_all)
+        return Target(decode, tuple(seeds), slowness, 1 << 24, notices_all, is_file=True)
 
     return make
 
@@ -482,6 +485,13 @@ def _damage(data, random):
         data[at:at] = random.bytes(size)
 
 
+def list_nothing(seed):
+    """Files that are none, or no more than the beginning of one."""
+    begin, noise = seed[:8], np.random.default_rng(1).bytes(len(seed))
+    ends = (b"", noise, bytes(len(seed)))
+    return [b"", seed[:1], noise, b"Dear friend,\n" * 99, *(begin + end for end in ends)]
+
+
 def attack(target, count):
     """Decode so many damaged inputs; return how many were refused, and most bytes taken.
 
@@ -491,11 +501,11 @@ def attack(target, count):
     for data in target.seeds:
         target.decode(data)  # compile, and fill caches, before memory is watched
     refused, most = 0, 0
+    nothing = [data for seed in target.seeds for data in list_nothing(seed) if target.is_file]
     damaged = mutations(target.seeds, np.random.default_rng(2))
     tracemalloc.start()
     try:
-        for _ in range(count):
-            data = next(damaged)
+        for data in chain(nothing, islice(damaged, count)):
             tracemalloc.reset_peak()
             before = tracemalloc.get_traced_memory()[0]
             message = ""
@@ -505,7 +515,8 @@ def attack(target, count):
                 message = str(fault)
             except Exception as fault:
                 raise AssertionError(f"{data!r} raises {type(fault).__name__}: {fault}") from fault
-            refused += bool(message)
+            assert message or data not in nothing, f"{data[:99]!r} is taken for a file"
+            refused += bool(message) and data not in nothing
             assert "\n" not in message, data
             taken = tracemalloc.get_traced_memory()[1] - before
             assert taken <= target.bound(len(data)), f"{data!r} takes {taken} bytes"
