@@ -20,7 +20,7 @@ from pathlib import Path
 
 from distributed import LocalCluster
 
-from apps.benchmarks.harness import Prepare, PreparedCase
+from apps.benchmarks.harness import BYTES_PER_MIB, Prepare, PreparedCase
 from apps.benchmarks.shots import bring_shots, make_instrument, simulate_shots
 from tofclip.sequences import RangingSettings, list_shots
 from tofclip.sequences.jobs import Summary, run_jobs
@@ -31,7 +31,6 @@ RATE_FRACTION = 0.75  # of the rate that a stream reaches: the pace at which lat
 
 ROWS, SMALL_ROWS, CLUSTER_ROWS = 1016, 576, 254
 SUFFIX = ".npz"
-BYTES_PER_MIB = 1 << 20
 
 
 def prepare_stream(rows: int, shots: int) -> PreparedCase:

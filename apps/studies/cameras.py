@@ -117,6 +117,8 @@ def measure_lines(
     their codes: PSNR of each seed, dB, against shift-and-add, and the first seed's picture. `lines`:
     their width, n_p, and the angle up to which they turn to either side, rad.
     """
+    from skimage.metrics import peak_signal_noise_ratio
+
     truth = light_field.refocus(shear)
     shape = (truth.shape[0], truth.shape[1])
     weight, pictures = None, []  # the weight chosen with the first seed is kept
@@ -124,15 +126,8 @@ def measure_lines(
         sensors = make_coded_line_sensors(shape, LINES, *lines, seed)
         picture, weight = recover_from_lines(light_field, shear, sensors, weight)
         pictures.append(picture)
-    return tuple(compute_psnr_db(one, truth) for one in pictures), pictures[0]
-
-
-def compute_psnr_db(estimate: AnyArray, truth: AnyArray) -> float:
-    """Peak signal-to-noise ratio in dB, relative to the brightest pixel of the truth."""
-    error = np.mean((estimate.astype(np.float64) - truth) ** 2)
-    if error == 0:
-        raise InputError("the estimate is the truth itself: its PSNR is infinite")
-    return 10 * np.log10(float(truth.max()) ** 2 / error)
+    score = partial(peak_signal_noise_ratio, truth, data_range=float(truth.max()))
+    return tuple(float(score(one)) for one in pictures), pictures[0]
 
 
 WIDTHS_PX = (1, 2, 4, 8, 16, 32, 64)

@@ -15,7 +15,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from apps.figures.style import (
@@ -24,6 +23,7 @@ from apps.figures.style import (
     add_colour_bar,
     draw_image,
     make_figure,
+    scale_brightness,
     store_picture,
 )
 from apps.progress import run_with_progress, show_progress
@@ -68,7 +68,6 @@ OWN_SETTING = "the table's"
 UNTRIED_SETTING = "the table's (others not tried)"
 
 PANEL_INCHES = 1.5
-WHITE_PERCENTILE = 99.5  # percentile drawn white: a lone bright pixel must not darken the rest
 MIN_SHEAR, MAX_SHEAR = -1.4, 0.8  # shears
 
 
@@ -238,8 +237,7 @@ def make_reproduction_figure(title: str, outcome: Outcome) -> Figure:
                 drawn = draw_image(place, panel.picture, **look)
                 add_colour_bar(place, drawn, "s (px per view)")
             else:
-                brightest = np.percentile(panel.picture, WHITE_PERCENTILE) or 1.0
-                draw_image(place, panel.picture, cmap="gray", vmin=0, vmax=brightest)
+                draw_image(place, panel.picture, cmap="gray", **scale_brightness(panel.picture))
             place.set_title(panel.title, fontsize=SMALL_FONT_PT - 2)
     return figure
 

@@ -10,7 +10,6 @@ from apps.studies.cameras import (
     MAX_ANGLE_RAD,
     DiffuserRecording,
     build_diffuser_model,
-    compute_psnr_db,
     halve_pictures,
     make_coded_line_sensors,
     measure_iteration_costs,
@@ -63,13 +62,6 @@ class TestCodedLine:
         sensors = make_coded_line_sensors((16, 16), 2, 1, MAX_ANGLE_RAD, 0)
         _, weight = recover_from_lines(self.two_views(0.1), 0.0, sensors)
         assert weight > 0
-
-    def test_psnr_of_a_known_error(self):
-        truth = np.zeros((4, 5), np.float32)
-        truth[0, 0] = 2
-        assert compute_psnr_db(truth + 0.2, truth) == pytest.approx(20)
-        with pytest.raises(InputError, match="infinite"):
-            compute_psnr_db(truth, truth)
 
 
 def test_every_method_is_counted_as_in_the_paper_and_timed():
