@@ -1,9 +1,8 @@
 """The console program `tofclip`: one verb, one function in a module of `apps.verbs`, and its help, made from
 its docstring.
 
-A verb's module is imported when the verb is called, so that the program's own help appears at once: the
-list of commands and the completion of a verb's name come from a table of names and one-line helps. A
-docstring ends in a paragraph that begins with ``Example:``; several such paragraphs are several examples.
+A verb's module is imported when the verb is called or listed, and imports little itself. A docstring ends in
+a paragraph that begins with ``Example:``; several such paragraphs are several examples.
 """
 
 from __future__ import annotations
@@ -124,30 +123,12 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   tofclip VERB --help explains a verb. Exit status: 0 done, 1 some failed,
   2 unusable input, 130 interrupted."""
 
-VERBS = {
-    "demo": "Simulate a scene of letters and plates, recover it from one streak image, and compare with the truth.",
-    "calibrate": "Find every view's slit centre and line angle, and draw the fits over the data.",
-    "calibrate range": "Find time zero, range walk, offsets, response and reflectance from shots of a target.",
-    "recover": "Recover every transient frame of a raw streak image, or of each one of a sequence.",
-    "cloud": "Find each pixel's returns and place them in space: x right, y down, z forward, in metres.",
-    "view": "Look at a source: on a page of the browser, in a window, as a picture or as a film.",
-    "stream": "Make a cloud of each shot while the next ones come; report method, rate and latencies.",
-    "lidar": "How well a range can be known, and how the views' parallax grows with it; many shots in a row.",
-    "nlos": "Image the scene hidden around a corner.",
-    "clip": "Light fields from few nonlocal measurements.",
-    "occlusion": "See through occluders: which places no view can see, and a demonstration of the others.",
-    "reproduce": "Make tables and figures of the paper again, its figures beside ours.",
-    "design": "Say what a CLIP instrument will see before it is built, by theory and by simulated shots.",
-    "bench": "Measure time and memory, each beside the least that the work needs.",
-    "devices": "Streak cameras, SPAD sensors, time taggers and their recordings, which tofclip record makes.",
-    "record": "Record an instrument: its bytes as they come, with clock, accounts and calibration.",
-    "convert": "Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall inside.",
-    "warm-up": "Run everything that is compiled on first use once, on small data.",
-    "plugins": "List methods, denoisers, readers and instruments, by whom they are, and what does not load.",
-    "doctor": "Say what this installation has: packages, GPU, USB, compiled loops, graphics, disk and memory.",
-    "info": "Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.",
-}
-"""The verbs, and groups of them, with their lines in the list of commands."""
+VERBS = (
+    *("demo", "calibrate", "calibrate range", "recover", "cloud", "view", "stream"),
+    *("lidar", "nlos", "clip", "occlusion", "reproduce", "design", "bench", "devices"),
+    *("record", "convert", "warm-up", "plugins", "doctor", "info"),
+)
+"""The verbs, and groups of them, in the order of the list of commands."""
 
 HOMES = {
     **dict.fromkeys(("demo", "warm-up", "plugins", "doctor"), "installation"),
@@ -171,8 +152,7 @@ class VerbGroup(TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        for name, line in VERBS.items():
-            self.add_command(TyperCommand(name, help=line, short_help=line))
+        self.commands: Any = dict.fromkeys(VERBS)
         self.rich_markup_mode = None
 
     def get_params(self, ctx: Any) -> list[Any]:
@@ -180,50 +160,53 @@ class VerbGroup(TyperGroup):
         return _hide_types_of_flags(super().get_params(ctx))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the verb that is called, and import it."""
+        """Take the two words of a verb as its name."""
         if " ".join(args[:2]) in VERBS:
             args = [" ".join(args[:2]), *args[2:]]
-        name, listed, further = super().resolve_command(ctx, args)
-        return name, (name and self.load_verb(name)) or listed, further
+        return super().resolve_command(ctx, args)
 
-    def load_verb(self, name: str) -> Command:
-        """Import a verb and return its command, which is a group if that is what its module has."""
-        own = re.sub("[- ]", "_", name)
-        home = import_module(f"apps.verbs.{HOMES.get(name, own)}")
-        is_group = not hasattr(home, own)
-        app: typer.Typer = home.app if is_group else typer.Typer()
-        if not is_group:
-            app.command(name)(getattr(home, own))
-        for verb in app.registered_commands:
-            _set_help(verb)
-        group = typer.main.get_group(app)
-        group.name = name
-        command: Any = group if is_group else group.commands[name]
-        simplify_help(command)
-        return command
+    def get_command(self, ctx: Any, cmd_name: str) -> Command | None:
+        return load_verb(cmd_name) if cmd_name in VERBS else None
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
         """Complete single words, as shells take them."""
         return [item for item in super().shell_complete(ctx, incomplete) if " " not in item.value]
 
 
-def make_group(name: str) -> typer.Typer:
-    """Return a group of `VERBS` that alone shows its help."""
+def load_verb(name: str) -> Command:
+    """Import a verb and return its command, which is a group if that is what its module has."""
+    own = re.sub("[- ]", "_", name)
+    home = import_module(f"apps.verbs.{HOMES.get(name, own)}")
+    is_group = not hasattr(home, own)
+    app: typer.Typer = home.app if is_group else typer.Typer()
+    if not is_group:
+        app.command(name)(getattr(home, own))
+    for verb in app.registered_commands:
+        _set_help(verb)
+    group = typer.main.get_group(app)
+    group.name, group.short_help = name, group.help
+    command: Any = group if is_group else group.commands[name]
+    simplify_help(command)
+    return command
+
+
+def make_group(meaning: str) -> typer.Typer:
+    """Return a group of verbs that alone shows its help."""
     app = typer.Typer()
 
     def show_help(context: typer.Context) -> None:
         if context.invoked_subcommand is None:
             print(context.get_help())
 
-    app.callback(invoke_without_command=True, help=VERBS[name])(show_help)
+    app.callback(invoke_without_command=True, help=meaning)(show_help)
     return app
 
 
-def walk_verbs(group: VerbGroup) -> dict[str, TyperCommand]:
+def walk_verbs() -> dict[str, TyperCommand]:
     """Import every verb and return the commands by the words that call them, as in the help."""
     found: dict[str, TyperCommand] = {}
     for name in VERBS:
-        command = group.load_verb(name)
+        command = load_verb(name)
         if isinstance(command, TyperGroup):
             found |= {f"{name} {word}": verb for word, verb in command.commands.items()}  # type: ignore[misc]
         else:

@@ -10,7 +10,7 @@ from pathlib import Path
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperOption
 
-from apps.cli import EPILOG, PROGRAM, VERB_OVERVIEW, app, split_docstring, walk_verbs
+from apps.cli import EPILOG, PROGRAM, VERB_OVERVIEW, split_docstring, walk_verbs
 
 COMPLETION_NOTE = """\
 `tofclip --install-completion` teaches the shell that it is called from (bash, zsh or fish) to complete verbs, options
@@ -19,7 +19,7 @@ and names of methods with the tab key; `tofclip --show-completion` only shows wh
 
 def collect_verbs() -> dict[str, TyperCommand]:
     """Return every verb that computes, by the words that call it, such as ``lidar scene``."""
-    return walk_verbs(typer.main.get_group(app))
+    return walk_verbs()
 
 
 def write_pages(folder: Path) -> list[Path]:

@@ -27,7 +27,7 @@ SURFACES = "surfaces"
 READABLE = "NPZ, HDF5, EXR with a part per view, or a folder."
 WRITABLE = (".h5", ".png", ".exr")
 
-app = make_group("clip")
+app = make_group("Light fields from few nonlocal measurements.")
 
 
 @app.command()

@@ -22,7 +22,9 @@ EXIT_DAMAGED = 2
 ADDRESS = arg("URI", "Such as timetag://SERIAL, file://run.h5 or 'sim+timetag://?seed=1'.")
 RECORDING = arg("H5", "Made by tofclip record.", read=True)
 
-app = make_group("devices")
+app = make_group(
+    "Streak cameras, SPAD sensors, time taggers and their recordings, which tofclip record makes."
+)
 
 
 @app.command("list")

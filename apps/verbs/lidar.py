@@ -40,7 +40,9 @@ from tofclip.files import PICTURE_SUFFIXES
 if TYPE_CHECKING:
     from tofclip.lidar.ros import StampedCloud
 
-app = make_group("lidar")
+app = make_group(
+    "How well a range can be known, and how the views' parallax grows with it; many shots in a row."
+)
 app.command()(photons)
 
 

@@ -94,7 +94,7 @@ BLUR_FACTOR = 1.2
 `nlos.resolution`.
 """
 
-app = make_group("nlos")
+app = make_group("Image the scene hidden around a corner.")
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,9 @@ SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board"
 SIDE_PX, LIVE_SIDE_PX = 128, 64
 """Rows and columns of the picture, unless given: a page shows a step every second."""
 
-app = make_group("occlusion")
+app = make_group(
+    "See through occluders: which places no view can see, and a demonstration of the others."
+)
 
 
 @app.command()

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from small_instrument import Outcome, Shell
 
 import tofclip
-from apps.cli import app, walk_verbs
+from apps.cli import walk_verbs
 from tofclip.errors import InputError
 from tofclip.files import require_apart
 from tofclip.storage import Record
@@ -73,7 +72,7 @@ def is_file(param):
     return is_path or param.param_type_name == "argument" or param.metavar in FILE_METAVARS
 
 
-VERBS = walk_verbs(typer.main.get_group(app))
+VERBS = walk_verbs()
 FILES = {
     verb: [param.name for param in command.params if is_file(param)]
     for verb, command in VERBS.items()
