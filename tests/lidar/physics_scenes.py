@@ -389,11 +389,12 @@ def make_shot(
     afterglow=0.0,
     haze=0.0,
     bend=0.0,
+    row_s=ROW_S,
 ):
     """Simulate a shot whose brightest streak pixel expects `photons`. `scene`: one of `SCENES`, or
     surfaces; `background`: photons a pixel; `afterglow`: fraction of the light that comes late, by 400 ps
     in the mean; `haze`: fraction that is scattered along the slit, 10 columns far in the mean; `bend`:
-    rows by which the outer views come later than a straight delay has them.
+    rows by which the outer views come later than a straight delay has them; `row_s`: duration of a row.
     """
     random = np.random.default_rng([seed, 0])
     if isinstance(scene, str):
@@ -404,11 +405,13 @@ def make_shot(
     width = round(10.6 * size)
     first = 2 * FIRST_RANGE_M / SPEED  # time of flight at the middle of row 0
 
+    rows = round(ROWS * ROW_S / row_s)
+
     def delay(column):  # rows
         way = (column - centres[3]) / (3 * 1.36 * size)
-        return 12.0 * way + (0.6 + bend) * way**2
+        return (12.0 * way + (0.6 + bend) * way**2) * ROW_S / row_s
 
-    gathered = np.zeros((ROWS * FINE, width))
+    gathered = np.zeros((rows * FINE, width))
     for view in range(7):
         origin = np.array([PITCH_M * STEPS[view], 0.0, 0.0])
         grid = np.arange(size * RAYS) / RAYS - size // 2 - 0.5
@@ -420,16 +423,16 @@ def make_shot(
         place, light = seen.place[lit], seen.light[lit]
         column = centres[view] + x[lit] - y[lit] * np.tan(ANGLES[view])
         path = np.linalg.norm(place, axis=1) + np.linalg.norm(place - origin, axis=1)
-        row = (path / SPEED - first) / ROW_S + delay(column)
+        row = (path / SPEED - first) / row_s + delay(column)
         fine = (row + 0.5) * FINE - 0.5
         below = np.floor(fine).astype(int)
         slit = np.rint(column).astype(int)
         for part, weight in ((below, 1 - (fine - below)), (below + 1, fine - below)):
-            there = (part >= 0) & (part < ROWS * FINE) & (slit >= 0) & (slit < width)
+            there = (part >= 0) & (part < rows * FINE) & (slit >= 0) & (slit < width)
             flat = part[there] * width + slit[there]
             brought = (GAINS[view] * light * weight)[there]
             gathered += np.bincount(flat, brought, gathered.size).reshape(gathered.shape)
-    late = (np.arange(-24 * FINE, 200 * FINE)) * ROW_S / FINE
+    late = (np.arange(-24 * FINE, 200 * FINE)) * row_s / FINE
     shape = np.exp(-4 * np.log(2) * (late / PULSE_S) ** 2)
     shape /= shape.sum()
     if afterglow:
@@ -440,10 +443,10 @@ def make_shot(
         away = np.exp(-np.abs(np.arange(-60, 61)) / 10)
         hazy = [np.convolve(row, away / away.sum(), "same") for row in gathered]
         gathered = (1 - haze) * gathered + haze * np.array(hazy)
-    length = ROWS * FINE + late.size
+    length = rows * FINE + late.size
     spectrum = np.fft.rfft(gathered, length, axis=0) * np.fft.rfft(shape, length)[:, None]
-    spread = np.fft.irfft(spectrum, length, axis=0)[24 * FINE :][: ROWS * FINE]
-    expected = np.maximum(spread.reshape(ROWS, FINE, width).sum(axis=1), 0)
+    spread = np.fft.irfft(spectrum, length, axis=0)[24 * FINE :][: rows * FINE]
+    expected = np.maximum(spread.reshape(rows, FINE, width).sum(axis=1), 0)
     expected *= photons / expected.max()
     counts = random.poisson(expected + background).astype(np.float32)
 
@@ -455,7 +458,7 @@ def make_shot(
     sweep = SkewSweep(centres, delay(centres), np.zeros(7))
     true_camera = camera.replace(gains=GAINS, sweep=sweep)
     names = [surface.name for surface in surfaces]
-    return Shot(counts, np.arange(ROWS) * ROW_S, camera, true_camera, names, truth)
+    return Shot(counts, np.arange(rows) * row_s, camera, true_camera, names, truth)
 
 
 def list_truth(surfaces, focal, size, random, side=6):

@@ -144,6 +144,22 @@ class ProjectiveSweep(Sweep):
         return raw_row / weight, raw_column / weight
 
 
+@dataclass(frozen=True)
+class MergedSweep(Sweep):
+    """A `sweep` for pictures in each of whose rows a `number` of successive ones are added up."""
+
+    sweep: Sweep
+    number: int
+
+    def __post_init__(self) -> None:
+        pass  # no arrays
+
+    def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
+        middle = (self.number - 1) / 2  # of the first row's
+        raw_row, raw_column = self.sweep.raw_position(self.number * row + middle, column)
+        return (raw_row - middle) / self.number, raw_column
+
+
 def sweep_from_record(record: Record) -> Sweep:
     """Rebuild whichever sweep `record` describes."""
     for kind in (SkewSweep, PolynomialSweep, ProjectiveSweep):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ from tofclip.recovery.defects import (
     list_noise_figures,
 )
 from tofclip.recovery.focus import DEFAULT_FOCUS, DepthLockedFocus, Focus, FrameSegment, parse_focus
-from tofclip.recovery.shot import Shot, open_shot
+from tofclip.recovery.shot import Shot, count_needless_rows, open_shot
 from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.shots import RELAY_WALL, Frames, Streak
 from tofclip.solvers import (
@@ -159,50 +159,46 @@ class RecoveryPlan:
         """
         started = time.perf_counter()
         shot, method = self.shot.fit_camera(progress), self.method
-        streak, clipping = shot.streak, find_clipping_level(shot.streak.counts)
-        measurement = measure(streak.counts, streak.saturated, shot.camera)
-
-        def recover_frames(method: Method, focus: Focus) -> Frames:
-            found = recover_measurement(
-                method,
-                shot.camera,
-                shot.times,
-                measurement,
-                describe_noise(streak, measurement) if method.has_prior else None,
-                focus,
-                self.device,
-                clip_from_below(streak, clipping),
-                progress,
-            )
-            of_shot = {
-                "method": method.name,
-                "focus": str(focus),
-                "device": str(self.device),
-                **count_defects(streak, clipping),
-            }
-            return replace(
-                found,
-                figures={**found.figures, **of_shot},
-                attachments=streak.attachments,
-                provenance={**streak.provenance, **found.provenance},
-            )
-
         if isinstance(method, SurfaceRecovery):
-            found = self._recover_surfaces(shot, method, recover_frames, progress)
+            found = self._recover_surfaces(shot, method, progress)
             seconds = time.perf_counter() - started
             pace = {"seconds": seconds, "frames_per_second": found.times.size / seconds}
         else:
-            found = recover_frames(method, self.focus)
+            found = self._recover_frames(shot, method, self.focus, progress)
             pace = {"seconds": time.perf_counter() - started}
         return replace(found, figures={**found.figures, **pace})
 
-    def _recover_surfaces(
-        self,
-        shot: Shot,
-        method: SurfaceRecovery,
-        recover_frames: Callable[[Method, Focus], Frames],
-        progress: Progress,
+    def _recover_frames(
+        self, shot: Shot, method: Method, focus: Focus, progress: Progress
     ) -> Frames:
+        """Recover the frames of a shot whose camera is known."""
+        streak, clipping = shot.streak, find_clipping_level(shot.streak.counts)
+        measurement = measure(streak.counts, streak.saturated, shot.camera)
+        found = recover_measurement(
+            method,
+            shot.camera,
+            shot.times,
+            measurement,
+            describe_noise(streak, measurement) if method.has_prior else None,
+            focus,
+            self.device,
+            clip_from_below(streak, clipping),
+            progress,
+        )
+        of_shot = {
+            "method": method.name,
+            "focus": str(focus),
+            "device": str(self.device),
+            **count_defects(streak, clipping),
+        }
+        return replace(
+            found,
+            figures={**found.figures, **of_shot},
+            attachments=streak.attachments,
+            provenance={**streak.provenance, **found.provenance},
+        )
+
+    def _recover_surfaces(self, shot: Shot, method: SurfaceRecovery, progress: Progress) -> Frames:
         """Recover frames, quickly, and then the surfaces in them; or better frames where there are none."""
         why = None
         if method.otherwise is not None and RELAY_WALL in shot.streak.attachments:
@@ -211,16 +207,24 @@ class RecoveryPlan:
             why = "frames at a given focus are asked for"
         if why is None:
             focus = DepthLockedFocus() if shot.camera.lenslet_pitch > 0 else self.focus
-            start = recover_frames(method.start, focus)
+            coarse = shot.merge_rows(count_needless_rows(shot))
+            start = self._recover_frames(coarse, method.start, focus, progress)
             try:
-                return method.recover_surfaces(shot.streak, start, progress, shot.centre_error_px)
+                found = method.recover_surfaces(
+                    coarse.streak, start, progress, shot.centre_error_px
+                )
             except InputError as fault:
                 if method.otherwise is None:
                     raise
                 # without what a message advises whoever asked for surfaces
                 why = re.split("[:;] (?:this shot|choose)", str(fault))[0]
+            else:
+                # a sweep is that of the shot's own rows
+                camera = found.camera.replace(sweep=shot.camera.sweep)
+                assert found.returns is not None
+                return replace(found, camera=camera, returns=replace(found.returns, camera=camera))
         assert method.otherwise is not None
-        found = recover_frames(method.otherwise, self.focus)
+        found = self._recover_frames(shot, method.otherwise, self.focus, progress)
         return replace(found, figures={**found.figures, "why_no_surfaces": why})
 
     def add_provenance(self, frames: Frames, *inputs: str | Path) -> Frames:

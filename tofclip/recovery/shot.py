@@ -7,16 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from tofclip.arrays import FloatArray
-from tofclip.camera import Camera
+from tofclip.arrays import AnyArray, FloatArray
+from tofclip.camera import Camera, estimate_dark_level
+from tofclip.camera.model import MergedSweep
 from tofclip.camera.registration import MAX_ROUND_COUNT, estimate_skew, register_views
 from tofclip.errors import InputError
 from tofclip.io import read_streak
-from tofclip.recovery.defects import mask_defects
+from tofclip.recovery.defects import find_clipping_level, mask_defects
 from tofclip.shots import Streak
 from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import PICOSECOND
 
+# Of its full width at half maximum: with fewer a pulse's place is less sure.
+ROWS_PER_PULSE = 3
 MAX_ROW_PER_PULSE = 100.0
 """Longest row, in widths of the pulse: beyond, the unit of one of them is wrong."""
 
@@ -45,6 +48,24 @@ class Shot:
         """Time of flight of each row, (rows,), s: the camera's time zero is taken off."""
         return self.streak.times - self.camera.time_zero
 
+    def merge_rows(self, number: int) -> Shot:
+        """Return this shot with so many successive rows added up in each; less than that are left out at
+        the end.
+        """
+        if number == 1:
+            return self
+        streak, camera = self.streak, self.camera
+        whole = len(streak.counts) // number * number
+
+        def split(rows: AnyArray) -> AnyArray:
+            return rows[:whole].reshape(-1, number, *rows.shape[1:])
+
+        bad = None if streak.saturated is None else split(streak.saturated).max(axis=1)
+        counts, times = split(streak.counts).sum(axis=1), split(streak.times).mean(axis=1)
+        sweep = None if camera.sweep is None else MergedSweep(camera.sweep, number)
+        streak = replace(streak, counts=counts, row_times=times, saturated=bad)
+        return replace(self, streak=streak, camera=camera.replace(sweep=sweep))
+
     def fit_camera(
         self, progress: Progress = ignore_progress, max_rounds: int = MAX_ROUND_COUNT
     ) -> Shot:
@@ -59,6 +80,24 @@ class Shot:
         freedom = max(found.views - 2, 1)
         error_px = float(np.sqrt(np.sum(moved_px**2) / freedom))
         return replace(self, camera=found, centre_error_px=error_px)
+
+
+def count_needless_rows(shot: Shot) -> int:
+    """Return how many rows of a shot may be added up in one, as the pulse lasts much longer: of frames of
+    less time each shows a thin line of what is turned, and hardly any light. One where readings are cut
+    off at the sensor's limit, which a sum does not show.
+    """
+    counts, times = shot.streak.counts, shot.streak.times
+    said = shot.camera.pulse_fwhm * (times.size - 1) / float(times[-1] - times[0])
+    if said < 1.5 * ROWS_PER_PULSE or np.isfinite(find_clipping_level(counts)):
+        return 1
+    # How long light stays the same is what a pulse lasts at most, whatever is said of it: a Gaussian
+    # is half like itself after 0.71 of its full width. Noise is not like that of the next row.
+    light = counts - np.float32(estimate_dark_level(counts))
+    lags = range(1, min(int(said), len(light) - 1) + 1)
+    like = np.array([np.vdot(light[:-lag], light[lag:]) for lag in lags])
+    seen = np.count_nonzero(np.logical_and.accumulate(like > like[0] / 2)) / np.sqrt(0.5)
+    return max(1, round(min(said, seen) / ROWS_PER_PULSE))
 
 
 def open_shot(
