@@ -266,7 +266,7 @@ def run_lensless_hand(library: Library, seeds: int, advance: Advance) -> Outcome
     rows, line = [], []
     for pitch, (scene, residual) in zip(PITCHES_PX, recoveries, strict=True):
         rows.append(Row((str(pitch),), (100 * residual,)))
-        line.append(Panel(f"every {pitch}. pixel\n{100 * residual:.2f} %", scene[window]))
+        line.append(Panel(f"pitch {pitch} px\n{100 * residual:.2f} %", scene[window]))
     return Outcome(("every n-th pixel",), "relative residual, %", rows, [line])
 
 

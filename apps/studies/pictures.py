@@ -114,7 +114,7 @@ def run_area_sensors(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover scenes of three complexities from every n-th sensor pixel on either axis."""
     solved = solve_cases(read_cases("fig4"), library, seeds, advance)
     panels = lay_out_lines(
-        solved, lambda case: case.scene, "{0}", lambda case: f"every {case.labels[1]}. pixel"
+        solved, lambda case: case.scene, "{0}", lambda case: f"pitch {case.labels[1]} px"
     )
     return _make_outcome(("scene", "sparsity"), solved, panels)
 

@@ -138,7 +138,7 @@ def write_result(result: Result, folder: Path) -> list[Path]:
     texts = {
         f"{name}.md": f"{render_section(result)}\n",
         f"{name}.csv": _render_csv(result),
-        f"{name}.json": json.dumps(result, indent=1, default=list),
+        f"{name}.json": json.dumps(result, indent=1, default=float),  # of float32
     }
     for file, text in texts.items():
         _write_text(folder / file, text)

@@ -4,6 +4,7 @@ paper's figures: their numbers are those of independent measurements and recover
 
 import csv
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,9 @@ from apps.studies.cases import (
     BestFigure,
     Case,
     Library,
+    Outcome,
+    Panel,
+    Row,
     choose_settings,
     list_best_cases,
     measure_case,
@@ -29,6 +33,7 @@ from apps.studies.report import (
     add_best,
     count_below,
     find_studies,
+    load_or_make_result,
     load_result,
     render_section,
     write_page,
@@ -251,6 +256,13 @@ class TestReproduce:
         assert "| CLIP-1D | figure-behind-bars | 1 |" in page
         assert "![Through occluders](reproduction/table7.png)" in page
         assert shell.figures(line, said="kept from an earlier run") == figures
+
+    def test_figures_of_any_precision_are_written(self, library, tmp_path):
+        row = Row(("matt", "unevenness"), (np.float32(1.5),))
+        outcome = Outcome(("plate", "figure"), "%", [row], [[Panel("plate", np.eye(4))]])
+        study = replace(STUDIES[0], work=lambda *_: outcome)
+        made, kept = (load_or_make_result(study, library, 1, tmp_path) for _ in range(2))
+        assert kept["rows"][0]["ours"] == [1.5] == list(made["rows"][0]["ours"])
 
     def test_a_damaged_or_other_result_is_made_again(self, tmp_path):
         path = tmp_path / "table7.json"
