@@ -200,8 +200,7 @@ def draw_history(axes: Axes, experiment: Experiment) -> None:
 
 FRAME_MS, LAST_FRAME_MS = 120, 2500
 DARK_THRESHOLD = 0.02  # of a return's brightest instant: the film passes over fainter ones
-# of a target that walks: how many, how far to either side (m), and how long each is shown
-WALK_STEPS, WALK_REACH_M, WALK_STEP_MS = 14, 18e-3, 180
+WALK_STEP_MS = 180
 PANEL_LAYOUT = {"left": 0.02, "right": 0.98, "bottom": 0.16, "top": 0.8}
 
 
@@ -268,14 +267,16 @@ def save_flash_film(experiment: Experiment, path: Path) -> None:
     film.save(path, FRAME_MS, LAST_FRAME_MS)
 
 
-def save_walk_film(experiment: Experiment, path: Path, advance: Callable[[int], None]) -> None:
-    """Write a GIF: the target walks past behind the occluder, in `WALK_STEPS` steps."""
+def save_walk_film(
+    experiment: Experiment, places: Sequence[float], path: Path, advance: Callable[[int], None]
+) -> None:
+    """Write a GIF: the target walks past behind the occluder, from one place, m, to the next."""
     names = ("one view, all its light", "one view, the second return", "ToF-CLIP", "truth")
     film = _Film((9.4, 2.9), names, experiment, columns=4, bottom=0.02)
     brightest = experiment.truth.max()
-    for number, across in enumerate(np.linspace(-WALK_REACH_M, WALK_REACH_M, WALK_STEPS)):
+    for number, across in enumerate(places):
         settings = replace(experiment.settings, seed=experiment.settings.seed + number)
-        there = type(experiment)(experiment.scene.move_target(float(across)), settings)
+        there = type(experiment)(experiment.scene.move_target(across), settings)
         everything = there.pictures[len(there.pictures) // 2].sum(axis=-1)
         seen = everything * (brightest / everything.max())
         pictures = seen, there.single_view, there.separated.target, there.truth

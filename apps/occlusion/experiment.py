@@ -54,6 +54,7 @@ from tofclip.solvers import TotalVariation
 Bodies = tuple[Body, ...]
 
 VIEW_COUNT = 7
+WALK_PLACES_M = np.linspace(-18e-3, 18e-3, 14).tolist()  # of a target that walks past
 MIDDLE_VIEW = (0.0, 0.0)
 FIELD_OF_VIEW_RAD = 0.45  # rad across the picture
 BIN_WIDTH_S, PULSE_FWHM_S = 20e-12, 60e-12  # the paper's streak camera

@@ -17,6 +17,7 @@ import numpy as np
 from apps.occlusion.experiment import (
     BASELINE_M,
     OCCLUDER_DISTANCE_M,
+    WALK_PLACES_M,
     Experiment,
     ExperimentSettings,
     OcclusionScene,
@@ -28,8 +29,6 @@ from tofclip.files import format_error_line
 from tofclip.occlusion import TimedMeasurements, separate_occluder
 from tofclip.simulate.light_fields import CameraArray
 from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT
-
-WALK_REACH_M, WALK_STEPS = 18e-3, 14  # to either side
 
 MAX_KEPT_FRAMES = 32
 # pixels brighter than this fraction of a picture's brightest hundredth are points of the scene
@@ -68,8 +67,7 @@ class WalkSource(Source):
         self._scene, self._settings = scene, settings
         self._kept, self._stopping = KeptFrames[WalkFrame](), threading.Event()
         self._seconds, self._failure_text = float("nan"), ""
-        places = np.linspace(-WALK_REACH_M, WALK_REACH_M, WALK_STEPS).tolist()
-        self._walk = itertools.cycle([*places, *places[-2:0:-1]])
+        self._walk = itertools.cycle([*WALK_PLACES_M, *WALK_PLACES_M[-2:0:-1]])
         self._take_step()
         self._thread = threading.Thread(target=self._run, name="walk", daemon=True)
         self._thread.start()

@@ -112,15 +112,11 @@ def demo(
 
     Example: tofclip occlusion demo --live --scene bush
     """
-    from apps.figures.occlusion import (
-        WALK_STEPS,
-        make_occlusion_figure,
-        save_flash_film,
-        save_walk_film,
-    )
+    from apps.figures.occlusion import make_occlusion_figure, save_flash_film, save_walk_film
     from apps.occlusion.experiment import (
         DEFAULT_PHOTONS,
         DISTANCE_FACTORS,
+        WALK_PLACES_M,
         Experiment,
         ExperimentSettings,
         make_occlusion_scene,
@@ -178,8 +174,8 @@ def demo(
     save_flash_film(experiment, written[1])
     if moving:
         written.append(out / "occlusion_moving.gif")
-        with show_progress("walking", WALK_STEPS) as advance:
-            save_walk_film(experiment, written[2], advance)
+        with show_progress("walking", len(WALK_PLACES_M)) as advance:
+            save_walk_film(experiment, WALK_PLACES_M, written[2], advance)
     # Correlations are with the target as seen with its occluder taken away.
     truth = experiment.truth
     correlation = correlation_coefficient(separated.target, truth)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Float32Array, FloatArray, IndexArray
 from tofclip.camera import Camera, SkewSweep
-from tofclip.shots import Streak
 from tofclip.simulate import (
     GroundTruth,
     Instrument,
@@ -142,12 +141,6 @@ def draw_cells(
     return np.divmod(
         np.searchsorted(cumulative, random.uniform(0, cumulative[-1], total), "right"), columns
     )
-
-
-def draw_exposure(light: LineLight, seed: int) -> Streak:
-    """Draw one exposure, without any instrument in between."""
-    counts = np.random.default_rng(seed).poisson(light.photons).astype(np.float32)
-    return Streak(counts, light.row_times, camera=light.camera)
 
 
 @lru_cache(maxsize=1)

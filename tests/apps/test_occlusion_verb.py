@@ -11,7 +11,6 @@ import pytest
 from PIL import Image
 from small_instrument import Shell
 
-from apps.figures import occlusion as occlusion_figures
 from apps.occlusion.experiment import (
     SCENES,
     Experiment,
@@ -66,7 +65,7 @@ class TestDemonstration:
     @classmethod
     def reported(cls, request, folder):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(occlusion_figures, "WALK_STEPS", 3)
+            patch.setattr("apps.occlusion.experiment.WALK_PLACES_M", [-18e-3, 0.0, 18e-3])
             words = "--scene plate --side-px 40 --sampling-ratio 1 --moving --out {folder}"
             return Shell(request).figures(f"occlusion demo {words}")
 

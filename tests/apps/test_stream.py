@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from devices.emulation.remoteex import EmulatedStreakCamera
-from devices.emulation.scenes import EmulatedLight, draw_exposure, simulate_line_light
+from devices.emulation.scenes import EmulatedLight, simulate_line_light
 from tofclip.camera import Camera, SkewSweep
 from tofclip.io.streaks import save_stack
 from tofclip.lidar import PointCloud, depth
 from tofclip.sequences.ranger import SurfacePipeline
 from tofclip.sequences.streaming import stream_clouds
-from tofclip.shots import Frames
+from tofclip.shots import Frames, Streak
 from tofclip.simulate import (
     Instrument,
     Scene,
@@ -38,7 +38,8 @@ def light():
 
 @pytest.fixture
 def made(light):
-    return [draw_exposure(light, seed) for seed in range(4)]
+    drawn = [np.random.default_rng(seed).poisson(light.photons) for seed in range(4)]
+    return [Streak(counts, light.row_times, camera=light.camera) for counts in drawn]
 
 
 def save_folder(shots):
