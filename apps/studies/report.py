@@ -226,7 +226,7 @@ def make_reproduction_figure(title: str, outcome: Outcome) -> Figure:
     lines = outcome.panels
     columns = max(map(len, lines))
     figure = make_figure(PANEL_INCHES * columns, (PANEL_INCHES + 0.35) * len(lines) + 0.4)
-    figure.suptitle(title, fontsize=SMALL_FONT_PT + 2)
+    figure.suptitle(title, fontsize=SMALL_FONT_PT + 2, wrap=True)
     axes = figure.subplots(len(lines), columns, squeeze=False)
     for row, line in zip(axes, lines, strict=True):
         for place in row:
