@@ -27,9 +27,7 @@ from tofclip.simulate.light_fields import CameraArray, TimeAxis
 from tofclip.solvers import TotalVariation
 from tofclip.units import SPEED_OF_LIGHT
 
-__all__ = [
-    "InactiveRegion",
-]
+__all__ = ["InactiveRegion"]
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from tofclip.lidar.neighbours import (
-    add_recovery_error,
-)
-from tofclip.lidar.peak_kernels import pool_significance
+from tofclip.lidar.neighbours import add_recovery_error
 
 SHAPE = (64, 64)
 GATE_M = 9e-3
@@ -85,16 +82,3 @@ def test_a_second_surface_in_the_same_pixels_takes_no_part():
     total = add_recovery_error(*twice, SHAPE, GATE_M)
     # Rounding decides whether a neighbour at the limit counts.
     assert np.isclose(total[::2], add_recovery_error(*returns), rtol=1e-6).mean() > 0.995
-
-
-def test_neighbours_count_within_a_ball_whose_radius_in_range_is_in_gates():
-    """Three pixels aside of a radius of four, a ball is root 7 gates deep: 2.65."""
-    pixel = np.array([24, 27, 27], np.int64)  # row 3, columns 3 and 6, of 7 x 7
-    starts = np.searchsorted(pixel, np.arange(50))
-    for off, counted in ((2.6, True), (2.7, False)):
-        distance = np.array([1.0, 1.0 + off * 0.01, 9.0])
-        pooled = np.empty(3)
-        own = np.array([1.0, 2.0, 4.0])
-        pool_significance(pixel, distance, own, starts, (7, 7), (4.0, 0.01), pooled)
-        assert pooled[0] == (3.0 if counted else 1.0)
-        assert pooled[2] == 4.0

@@ -175,11 +175,9 @@ class PhotonImage:
             No photon, or a time that is negative or not finite.
         """
         when = np.asarray(bin_number, dtype=np.float32)
-        if not when.size:
-            raise InputError("no pixel counted a photon")
-        if not np.all(np.isfinite(when)) or when.min() < 0:
+        if not np.all(np.isfinite(when)) or when.min(initial=0) < 0:
             raise InputError("photon times must be finite and not negative")
-        length = int(when.max()) + 1 if bins is None else bins
+        length = int(when.max(initial=0)) + 1 if bins is None else bins
         order = np.argsort(pixel, kind="stable")
         offsets = np.searchsorted(pixel[order], np.arange(image_shape[0] * image_shape[1] + 1))
         own = offsets.astype(np.int64), when[order], np.ones(when.size, np.float32)
