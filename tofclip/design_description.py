@@ -22,7 +22,6 @@ from tofclip.shots import Frames
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate
 from tofclip.simulate.patterns import (
     Pattern,
-    cut_pattern,
     make_checkerboard,
     make_letter,
     make_mottled_pattern,
@@ -249,16 +248,12 @@ def _make_dense(operator: LinearOperator) -> Float32Array:
 Plate = tuple[Pattern, tuple[float, float], tuple[float, float], float, float]
 
 
-def _cut_letter(name: str) -> Pattern:
-    return cut_pattern(make_letter(name), make_plain_pattern(0.8))
-
-
 SCENES: dict[str, tuple[Plate, ...]] = {
     "letters": (
-        (_cut_letter("C"), (-0.45, -0.42), (0.34, 0.34), 0.05, 0.0),
-        (_cut_letter("L"), (0.42, -0.45), (0.32, 0.32), 0.3, 0.1),
-        (_cut_letter("U"), (-0.4, 0.42), (0.32, 0.32), 0.55, 0.0),
-        (_cut_letter("A"), (0.42, 0.4), (0.36, 0.36), 0.8, -0.1),
+        (make_letter("C", 0.8), (-0.45, -0.42), (0.34, 0.34), 0.05, 0.0),
+        (make_letter("L", 0.8), (0.42, -0.45), (0.32, 0.32), 0.3, 0.1),
+        (make_letter("U", 0.8), (-0.4, 0.42), (0.32, 0.32), 0.55, 0.0),
+        (make_letter("A", 0.8), (0.42, 0.4), (0.36, 0.36), 0.8, -0.1),
     ),
     "plates": (
         (make_checkerboard(4, 0.3, 0.9), (-0.4, -0.35), (0.36, 0.36), 0.1, -0.3),

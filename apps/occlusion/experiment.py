@@ -307,7 +307,7 @@ V_SIDE_M, V_HEIGHT_M = 13e-3, 16e-3
 
 def _make_v_letter() -> Bodies:
     """Supplementary Figure 14c: the axis meets the V below 0.6, where its strokes have joined."""
-    pattern = cut_pattern(make_letter("V"), make_plain_pattern(OCCLUDER_REFLECTANCE))
+    pattern = make_letter("V", OCCLUDER_REFLECTANCE)
     return (_make_plate(V_SIDE_M, V_HEIGHT_M, pattern, y=-0.25 * V_HEIGHT_M),)
 
 
@@ -447,7 +447,7 @@ def probe_target(
     focal_length_px = distance * TARGET_PX / width
     setup = CameraSetup("line", 1.0, seed)
     rig = make_rig(region, PICTURE_PX, focal_length_px, distance, 2, setup)
-    letter = cut_pattern(make_letter("L"), make_plain_pattern(0.9))
+    letter = make_letter("L", 0.9)
     target = _make_plate(width, width, letter, z=distance)
     # one bin about the target's return that opens halfway from the occluder's
     near, far = rig.compute_flight_time(np.array([region.distance, distance]))

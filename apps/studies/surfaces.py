@@ -33,10 +33,8 @@ from tofclip.simulate.bodies import Body, Lambertian, Sphere
 from tofclip.simulate.demo import ANGLES_DEG, GAINS, LENSLET_PITCH_M, place_plate
 from tofclip.simulate.patterns import (
     TEXELS,
-    cut_pattern,
     make_checkerboard,
     make_letter,
-    make_plain_pattern,
     make_rings,
     make_stripes,
 )
@@ -125,7 +123,7 @@ def make_gauze_scene() -> Scene:
     """Return a gauze that hides 5/9 of a letter and a wall behind it."""
     y, x = np.indices((TEXELS, TEXELS))
     gauze = np.where((x % 3 == 0) | (y % 3 == 0), 0.8, np.nan).astype(np.float32)
-    letter = cut_pattern(make_letter("A"), make_plain_pattern(0.8))
+    letter = make_letter("A", 0.8)
     return Scene(
         (
             _place(gauze, (-6, 4), 38, 1.85),

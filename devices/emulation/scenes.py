@@ -23,7 +23,6 @@ from tofclip.simulate import (
 )
 from tofclip.simulate.demo import place_plate
 from tofclip.simulate.patterns import (
-    cut_pattern,
     make_letter,
     make_plain_pattern,
     make_stripes,
@@ -93,7 +92,7 @@ def make_line_scene() -> Scene:
     bright = make_plain_pattern(0.8)
     return Scene(
         (
-            place_plate(cut_pattern(make_letter("U"), bright), (-26, -22), 44, 1.75),
+            place_plate(make_letter("U", 0.8), (-26, -22), 44, 1.75),
             place_plate(bright, (24, -24), 36, 2.1, yaw=0.15),
             place_plate(make_plain_pattern(0.7), (-24, 26), 34, 2.5),
             place_plate(bright, (24, 24), 40, 2.8, pitch=-0.15),

@@ -35,7 +35,6 @@ from tofclip.simulate.light_fields import (
     render_view,
 )
 from tofclip.simulate.patterns import (
-    cut_pattern,
     make_checkerboard,
     make_letter,
     make_mottled_pattern,
@@ -87,7 +86,7 @@ def test_the_shear_map_is_exact_and_the_nearer_body_hides_the_other_whatever_the
 
 
 def test_letters_cut_out_let_the_ground_be_seen():
-    front = plate(-1.0, cut_pattern(make_letter("L"), make_plain_pattern(0.9)), 0.3)
+    front = plate(-1.0, make_letter("L", 0.9), 0.3)
     picture = look(front, plate(0.5, make_plain_pattern(0.1), 4.0))
     assert picture[12, 17] == pytest.approx(0.9)  # the stem
     assert picture[12, 31] == pytest.approx(0.1)  # right of it

@@ -33,7 +33,7 @@ from tofclip.simulate import (
     simulate_shot,
 )
 from tofclip.simulate.demo import FOCAL_LENGTH_PX
-from tofclip.simulate.patterns import TEXELS, cut_pattern, make_letter, make_plain_pattern
+from tofclip.simulate.patterns import TEXELS, make_letter
 from tofclip.solvers import Backprojection, Sparse
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -67,13 +67,9 @@ def make_facing_plate(pattern, place_px, side_px, distance, focal=FOCAL):
     return make_plate((x, y, distance), (side, side), pattern)
 
 
-def letter(name, brightness):
-    return cut_pattern(make_letter(name), make_plain_pattern(brightness))
-
-
 SCENE = Scene(
     tuple(
-        make_facing_plate(letter(name, 0.8), place, 18, distance)
+        make_facing_plate(make_letter(name, 0.8), place, 18, distance)
         for name, place, distance in zip("UCLAU", PLACES, RANGES, strict=True)
     )
 )
@@ -227,7 +223,7 @@ def make_shadow_scene():
     across = (np.arange(TEXELS) + 0.5) / TEXELS - 0.5
     radius = np.hypot(across[:, np.newaxis], across) / BEAM_RADIUS_FRACTION
     beam = np.where(radius <= 1, 0.9 * RIM_BRIGHTNESS_FRACTION ** (radius**2), 0)
-    plates = [(letter(name, 0.7), place, LETTER_SIDE_PX, z) for name, place, z in LETTERS]
+    plates = [(make_letter(name, 0.7), place, LETTER_SIDE_PX, z) for name, place, z in LETTERS]
     plates.append((beam.astype(np.float32), (0, 0), WALL_SIDE_PX, WALL_DEPTH_M))
     bodies = tuple(make_facing_plate(*one, FOCAL_LENGTH_PX) for one in plates)
     return Scene(bodies, LAMP_POSITION_M)

@@ -29,7 +29,7 @@ from tofclip.simulate import (
     score_returns,
     simulate_shot,
 )
-from tofclip.simulate.patterns import cut_pattern, make_letter, make_plain_pattern
+from tofclip.simulate.patterns import make_letter
 from tofclip.solvers import LinearInverse, Sparse, TotalVariation
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -72,7 +72,7 @@ def test_the_letters_are_upright_and_not_mirrored(shot):
     # the U, 34 pixels wide around (-25, -24) from the optical axis, is the nearest plate; compare
     # with its drawing
     seen = shot.truth.range[64 - 24 - 17 : 64 - 24 + 17, 64 - 25 - 17 : 64 - 25 + 17] < 1.9
-    drawn = np.isfinite(cut_pattern(make_letter("U"), make_plain_pattern(0.5)))
+    drawn = np.isfinite(make_letter("U", 0.5))
     step = ((np.arange(34) + 0.5) / 34 * drawn.shape[0]).astype(int)
     picture = drawn[np.ix_(step, step)]
     assert np.mean(seen == picture) > 0.93  # the borders lie half a pixel aside

@@ -21,7 +21,6 @@ from tofclip.simulate import (
 )
 from tofclip.simulate.bodies import NO_BODY, cast_rays, look_up_reflectance
 from tofclip.simulate.patterns import (
-    cut_pattern,
     make_letter,
     make_plain_pattern,
     make_stripes,
@@ -105,7 +104,7 @@ def test_a_plate_casts_a_shadow_that_a_distant_lamp_moves_aside():
     ],
 )
 def test_letters_have_their_shape(name, inside, outside):
-    lit = np.isfinite(cut_pattern(make_letter(name), make_plain_pattern(0.8)))
+    lit = np.isfinite(make_letter(name, 0.8))
     rows, columns = lit.shape
     assert all(lit[int(y * rows), int(x * columns)] for x, y in inside)
     assert not any(lit[int(y * rows), int(x * columns)] for x, y in outside)
@@ -213,7 +212,7 @@ def test_recovery_s_operator_agrees_with_the_ray_caster(depth):
     # Two independent ways to the same picture; they differ by what a pixel's finite height spreads
     # on the slit.
     made, side = instrument(around=depth), 30 * depth / FOCAL
-    letter = cut_pattern(make_letter("A"), make_plain_pattern(0.9))
+    letter = make_letter("A", 0.9)
     scene = plate(letter, (side, side), depth)
     shot = simulate_shot(scene, made, 0)
     frames = np.moveaxis(render_true_frames(scene, made, shot.exposure).values, 0, -1)
@@ -306,7 +305,7 @@ PLAIN = make_plain_pattern(0.5)
         (lambda: make_plate((0, 0, 1), (0, 1), PLAIN), "positive size"),
         (lambda: make_plate((0, 0, np.inf), (1, 1), PLAIN), "finite position"),
         (lambda: Scene(()), "at least one body"),
-        (lambda: make_letter("Q"), "unknown letter 'Q'"),
+        (lambda: make_letter("Q", 0.5), "unknown letter 'Q'"),
         (
             lambda: simulate_shot(plate(PLAIN, (1, 1), -2.0), instrument(), 0),
             "no light of the scene",

@@ -15,10 +15,8 @@ from tofclip.camera import Camera, SkewSweep
 from tofclip.simulate.bodies import Body, Vector
 from tofclip.simulate.patterns import (
     Pattern,
-    cut_pattern,
     make_checkerboard,
     make_letter,
-    make_plain_pattern,
     make_rings,
     make_stripes,
 )
@@ -72,13 +70,12 @@ def make_default_instrument() -> Instrument:
 
 def make_default_scene() -> Scene:
     """Return four cut-out letters and three textured plates between 1.7 and 3.2 m."""
-    letters = {name: cut_pattern(make_letter(name), make_plain_pattern(0.8)) for name in "UCLA"}
     # pattern, middle and side in pixels, depth in m, yaw and pitch in rad
     plates: tuple[tuple[Pattern, Any, float, float, float, float], ...] = (
-        (letters["U"], (-25, -24), 34, 1.75, 0.0, 0.0),
-        (letters["C"], (23, -27), 34, 2.05, 0.15, 0.0),
-        (letters["L"], (-24, 22), 32, 2.35, 0.0, 0.0),
-        (letters["A"], (22, 20), 36, 2.62, 0.0, -0.15),
+        (make_letter("U", 0.8), (-25, -24), 34, 1.75, 0.0, 0.0),
+        (make_letter("C", 0.8), (23, -27), 34, 2.05, 0.15, 0.0),
+        (make_letter("L", 0.8), (-24, 22), 32, 2.35, 0.0, 0.0),
+        (make_letter("A", 0.8), (22, 20), 36, 2.62, 0.0, -0.15),
         (make_checkerboard(4, 0.3, 0.9), (2, -2), 36, 2.85, -0.3, 0.0),
         (make_rings(3, 0.3, 0.9), (-2, 36), 36, 3.0, 0.0, 0.0),
         (make_stripes(4, 0.3, 0.9), (0, 0), 96, 3.18, 0.0, 0.0),

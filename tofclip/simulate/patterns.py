@@ -54,12 +54,6 @@ LETTERS: dict[str, list[Outline]] = {
 }
 
 
-def make_letter(name: str) -> list[Outline]:
-    """Outlines of a capital letter of `LETTERS`."""
-    require_known("letter", name, LETTERS)
-    return LETTERS[name]
-
-
 def cut_pattern(outlines: list[Outline], pattern: Pattern) -> Pattern:
     """Keep of `pattern` what lies inside polygons (corners, 2) over the unit square; the rest becomes
     NaN. An outline within another one cuts a hole (even-odd rule).
@@ -79,6 +73,12 @@ def cut_pattern(outlines: list[Outline], pattern: Pattern) -> Pattern:
 def make_plain_pattern(reflectance: float) -> Pattern:
     """An even surface."""
     return np.full((TEXELS, TEXELS), reflectance, dtype=np.float32)
+
+
+def make_letter(name: str, reflectance: float) -> Pattern:
+    """An even capital letter of `LETTERS`, cut out."""
+    require_known("letter", name, LETTERS)
+    return cut_pattern(LETTERS[name], make_plain_pattern(reflectance))
 
 
 def make_checkerboard(squares: int, dark: float, bright: float) -> Pattern:

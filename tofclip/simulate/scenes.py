@@ -24,7 +24,6 @@ from tofclip.simulate.bodies import (
 from tofclip.simulate.light_fields import CameraArray, Scene
 from tofclip.simulate.patterns import (
     Pattern,
-    cut_pattern,
     make_checkerboard,
     make_letter,
     make_mottled_pattern,
@@ -116,14 +115,15 @@ def _make_still_life(stage: _SceneBuilder) -> Scene:
 def _make_blocks(stage: _SceneBuilder) -> Scene:
     rings = Lambertian(make_rings(4, 0.2, 0.9)[38:154, 38:154])
     block = stage.plate((24, 16), (40, 44, 40), 0.0, rings, Box).tilt(-0.5)
-    card = stage.plate((-26, -14), (50, 56), -0.6, _cut_letter("A"))
+    card = stage.plate((-26, -14), (50, 56), -0.6, Lambertian(make_letter("A", 0.9)))
     return stage.scene(0.8, make_stripes(18, 0.15, 0.45), block, card)
 
 
 def _make_letters(stage: _SceneBuilder) -> Scene:
     letters = (("C", (-38, -22), -1.0), ("L", (0, 2), -0.4), ("A", (38, 26), -0.1))
     plates = (
-        stage.plate(place, (36, 44), shear, _cut_letter(name)) for name, place, shear in letters
+        stage.plate(place, (36, 44), shear, Lambertian(make_letter(name, 0.9)))
+        for name, place, shear in letters
     )
     return stage.scene(0.5, make_plain_pattern(0.02), *plates)
 
@@ -172,10 +172,6 @@ def _make_occluded_scene(stage: _SceneBuilder, target: str, occluder: str) -> Sc
     width, places = (9, (-45, -15, 15, 45)) if occluder == "bars" else (14, (-20, 26))
     bodies += [stage.plate((x, 0), (width, 200), OCCLUDER_SHEAR, BLACK_MATERIAL) for x in places]
     return stage.scene(0.5, make_plain_pattern(0.01), *bodies)
-
-
-def _cut_letter(name: str) -> Lambertian:
-    return Lambertian(cut_pattern(make_letter(name), make_plain_pattern(0.9)))
 
 
 def _print_text(text: str, ink: float, paper: float = float("nan")) -> Lambertian:
