@@ -99,6 +99,11 @@ class BinnedResponse:
         samples = np.maximum(self.pulse.samples, DENSITY_FLOOR)
         return samples / (samples.sum() * self.step)
 
+    @property
+    def times(self) -> FloatArray:
+        """Time of each sample after the surface, in bins."""
+        return self.start + self.step * np.arange(self.density.size, dtype=np.float64)
+
     @cached_property
     def log_slope(self) -> FloatArray:
         """Minus the slope of the density's logarithm at each sample, per bin; where the response is
@@ -111,9 +116,8 @@ class BinnedResponse:
         """Share of the photons in each of the coarse bins, of so many bins, around the one that holds
         the surface, anywhere in it; and the number of the first relative to the surface's.
         """
-        times = self.start + self.step * np.arange(self.density.size)
         inside = np.arange(8) / 8 + 1 / 16 - 0.5  # eight places, in the middles of eighths
-        number = np.floor(times[:, np.newaxis] / coarse + inside + 0.5).astype(np.int64)
+        number = np.floor(self.times[:, np.newaxis] / coarse + inside + 0.5).astype(np.int64)
         first = int(number.min())
         weight = np.repeat(self.density, inside.size)
         shares = np.bincount((number - first).ravel(), weight).astype(np.float64)
@@ -381,8 +385,8 @@ def learn_response(
     sums[:, 0] -= sums[:, 1] * before[0] / max(before[1], 1e-9)
     start, width_seen = first - early[0], float(SAMPLES_PER_WIDTH) / 2
     response, slots = scene.response, step * np.arange(early[0], last + 1)
-    place = response.start + response.step * np.arange(response.density.size)
-    known = np.maximum(np.interp(slots, place, response.density, 0, 0), DENSITY_FLOOR / width)
+    shares = np.interp(slots, response.times, response.density, 0, 0)
+    known = np.maximum(shares, DENSITY_FLOOR / width)
     sums[:, 2] *= known
     # As smooth as its own width allows, which is not known before it has been smoothed once. What is
     # smooth is the ratio to the response known before: the response gets no wider.

@@ -371,9 +371,8 @@ def estimate_emptiness(
     what explains all pixels best.
     """
     response, side = scene.response, EMPTY_POOL_PX
-    times = response.start + response.step * np.arange(response.density.size)
     # a response's tail holds little light and much background
-    bright = times[response.density >= response.density.max() / 2]
+    bright = response.times[response.density >= response.density.max() / 2]
     short = float(bright[-1] - bright[0]) + max(response.step, 1.0)
     length = response.width - 2 * response.start
 
@@ -425,8 +424,7 @@ def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> Phot
     background does.
     """
     response = scene.response
-    times = response.start + response.step * np.arange(response.density.size)
-    bright = times[response.density >= MIN_EXPLAINED_DENSITY * response.density.max()]
+    bright = response.times[response.density >= MIN_EXPLAINED_DENSITY * response.density.max()]
     late = photons.times_after(layer[..., 0])
     return photons.select(photons.count * ~((late >= bright[0]) & (late <= bright[-1])))
 
