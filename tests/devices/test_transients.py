@@ -151,14 +151,14 @@ def test_a_slow_viewer_gets_the_newest_picture_and_is_told_of_the_others():
     stream = read_transients("sim+remoteex://?seed=2&scene=small&frame_rate=100")
     next(stream)
     assert stream.is_live
-    for _ in range(3):
-        time.sleep(0.3)
+    for _ in range(2):
+        time.sleep(0.8)
         next(stream)
         assert stream.stamp is not None
         assert 0 < stream.stamp.taken_at <= stream.stamp.received_at
-        assert time.monotonic() - stream.stamp.taken_at < 0.25
+        assert time.monotonic() - stream.stamp.taken_at < 0.6
     stats = stream.stats
     assert stats.dropped_host + stats.lost_device > 10
-    assert stream.shots_acquired >= 4 + stats.dropped_host + stats.lost_device
+    assert stream.shots_acquired >= 3 + stats.dropped_host + stats.lost_device
     stream.close()
     assert stream.stats.is_balanced
