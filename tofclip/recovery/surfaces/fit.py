@@ -40,13 +40,15 @@ from tofclip.solvers import Progress, ignore_progress
 from tofclip.threads import limit_blas_threads
 
 START_ITERATIONS = 25
-MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 6, 10
+MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 5, 10
 AGAINST_DIM = 3.0  # until ranges are known; then amplitudes are as the shot has them
 # What dim light costs, in deviations, and for how many iterations at most, where it is to stay only as
 # the shot needs it: first it gives way, then what is needed comes back. Fewer after the first shot.
 SPARSELY, FOLLOWING_SPARSELY = ((4.0, 80), (2.0, 20)), ((4.0, 50), (2.0, 10))
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
 LAST_STEP_SIGMAS = 0.15
+# After a longer one of its own a surface goes on alone, for as many steps.
+LONG_STEP_SIGMAS, SETTLING_STEPS = 0.7, 3
 # Where the last shot's fit begins: before and after the ranges' step, and how far beyond the returns
 # of quick frames surfaces may reach.
 FOLLOWING_ITERATIONS, FOLLOWING_MARGIN_PX = 10, 4
@@ -272,6 +274,16 @@ def join_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
     return solver
 
 
+def _take_apart(solver: AmplitudeSolver, surfaces: Sequence[int] | Pixels) -> AmplitudeSolver:
+    """Return some surfaces before what the others leave of the shot."""
+    model, own = solver.model, np.zeros(len(solver.model.masks), bool)
+    own[np.asarray(surfaces)] = True
+    apart = solver.cover(model.masks & own[:, np.newaxis, np.newaxis])
+    others = np.where(own[model.surface], np.float32(0), solver.amplitude)
+    apart.model.image = model.image - model.render(others)
+    return apart
+
+
 def _list_doubles(solver: AmplitudeSolver) -> list[tuple[int, int]]:
     """Pairs of surfaces of which the smaller is, in a part of its pixels, where the larger is; the larger
     one first.
@@ -374,11 +386,33 @@ def _refine(
         light = solver.amplitude + np.finfo(np.float32).tiny
         lengths.append([np.sqrt(np.average(moved[p] ** 2, weights=light[p])) for p in model.parts])
         lit = solver.amplitude > 0
-        sigmas = moved[lit] / model.estimate_deviation(found.covariances)[lit]
-        if number + 1 >= MIN_REFINEMENTS and np.sqrt(np.mean(sigmas**2)) < LAST_STEP_SIGMAS:
-            break
+        squares = np.where(lit, moved / model.estimate_deviation(found.covariances), 0) ** 2
+        far, points = (np.bincount(model.surface, one, len(model.parts)) for one in (squares, lit))
+        if number + 1 >= MIN_REFINEMENTS:
+            if far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
+                break
+            if number + 1 < MAX_REFINEMENTS:
+                settle_surfaces(solver, far > LONG_STEP_SIGMAS**2 * points)
     assert found is not None
     return found, extrapolate_steps(np.array(lengths))
+
+
+def settle_surfaces(solver: AmplitudeSolver, chosen: NDArray[np.bool_]) -> None:
+    """Take further steps on the ranges of some surfaces, (surfaces,), alone: where one has far to go, as
+    a ball on a table, all others and the instrument have long been settled.
+    """
+    if not chosen.any():
+        return
+    apart, step, model = _take_apart(solver, np.flatnonzero(chosen)), None, solver.model
+    for _ in range(SETTLING_STEPS):
+        step = refine_state(apart.model, apart.amplitude, step, instrument=False)
+        apart.amplitude = step.amplitude
+        apart.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+    state, found = model.state.copy(), iter(apart.model.state.coefficients)
+    for surface in np.flatnonzero(chosen):
+        state.coefficients[surface] = next(found)
+    model.place(state)
+    solver.amplitude[chosen[model.surface]] = apart.amplitude
 
 
 def extrapolate_steps(lengths: FloatArray) -> FloatArray:

@@ -21,7 +21,12 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
-from tofclip.recovery.surfaces.amplitudes import TINY, explain_by_amplitude, scale_amplitude
+from tofclip.recovery.surfaces.amplitudes import (
+    TINY,
+    explain_by_amplitude,
+    scale_amplitude,
+    share_misfit,
+)
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, Window
 from tofclip.recovery.surfaces.pulse import Image, differentiate_pulse
 from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, Pixels, QuadricBasis
@@ -31,7 +36,9 @@ WIDTH_STEP = 0.02  # relative; for the derivative by a pulse's width
 CLUSTER_ROWS, CLUSTER_COLUMNS = 12, 48  # measurements whose misfits may depend on each other
 LEAST_VARIANCE = 1e-12  # of the largest one
 MAX_LEVERAGE = 0.9  # of a cluster: what it alone determines, its misfit says nothing about
-SMALLEST_STEP = 1 / 16  # of a Gauss-Newton step, halved until it lowers the misfit
+# Parts of a Gauss-Newton step that are tried until it lowers the misfit, then none; and of the most by
+# which a surface explains less than before, what shortens its step.
+PARTS, SHORTENING_LOSS = (1, 1 / 4, 1 / 16, 0), 0.1
 # Rows by which each view's part of a sweep that was found from the shot is off: root mean squares of
 # scenes by a forward model of their own (0.015 and 0.05 in the demonstration). Later views and farther
 # surfaces look alike, so that the mean over the views is what all ranges have in common.
@@ -78,20 +85,22 @@ class Derivatives(NamedTuple):
         return slice(self.row, self.row + rows), slice(self.column, self.column + columns)
 
 
-def iterate_derivatives(model: SurfaceModel, amplitude: Image) -> Iterator[Derivatives]:
+def iterate_derivatives(
+    model: SurfaceModel, amplitude: Image, instrument: bool = True
+) -> Iterator[Derivatives]:
     """Yield the image's derivatives by the unknowns of the state, each view's and surface's, part by
     part. The reference view keeps its delay and stretch: time zero is its own. Derivatives by gains
-    and widths are by their logarithms.
+    and widths are by their logarithms. `instrument`: by what is uncertain of it as well.
     """
     views = range(model.camera.views)
     others = [view for view in views if view != model.reference]
     surfaces = range(len(model.masks))
-    for work, numbers in (
+    views_own = (
         (_differentiate_view, views),
         (_differentiate_sweep, others),
         (_differentiate_borders, range(1)),
-        (_differentiate_surface, surfaces),
-    ):
+    )
+    for work, numbers in (*views_own * instrument, (_differentiate_surface, surfaces)):
         parts = model.map(partial(work, model, amplitude), numbers)
         yield from itertools.chain.from_iterable(parts)
 
@@ -319,11 +328,12 @@ def refine_state(
     amplitude: Image,
     earlier: Refinement | None = None,
     robust: bool = False,
+    instrument: bool = True,
 ) -> Refinement:
     """Take a Gauss-Newton step on ranges, gains, pulse widths and, from the second step on, delays
     and stretches, if it lowers the misfit that amplitudes cannot explain. The model is moved in
     place; the mean gain stays, and so does the mean brightness behind a surface. What the step
-    before this one (`earlier`) knew saves work.
+    before this one (`earlier`) knew saves work. Without the `instrument`, on ranges alone.
     """
     given, model.weights = model.weights, doubt_borders(model, amplitude)
     error = model.image - model.render(amplitude)
@@ -340,7 +350,7 @@ def refine_state(
     # 2. As long as ranges are off by much, late views would take a part of it: ranges go first.
     groups = [
         group
-        for group in iterate_derivatives(model, amplitude)
+        for group in iterate_derivatives(model, amplitude, instrument)
         if (earlier is not None and earlier.steps) or group.names[0][0] not in SWEEP_SIGMAS
     ]
     groups = _leave_out_even_shading(model, groups, rest)
@@ -368,19 +378,28 @@ def refine_state(
         covariance += PULL_SIGMAS**2 * np.outer(pull, pull)
 
     # 4. With as many iterations before the step as after it, so that these alone do not make it good.
-    # A step that is far too long may overflow: it is refused like others that lower nothing.
+    # A step that is far too long may overflow: it is refused like others that lower nothing. Where
+    # surfaces explain less than before, these go less far, and do not hold the others back.
     settled, left = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
     before, state = compute_objective(model, left), model.state
     moved, free, rest = amplitude, amplitude + settled, left
-    halved = np.outer(0.5 ** np.arange(1 - np.log2(SMALLEST_STEP)), newton)
+    ranges = "coefficients", "patterns", "shading"
+    owners = np.array([one if name in ranges else len(model.parts) for name, one, _ in names])
+    tries = np.zeros(len(model.parts) + 1, np.intp)
     with np.errstate(over="ignore", invalid="ignore"):
-        for taken in halved:
-            ahead = _move(model, state, amplitude, names, taken, changes)
-            error = model.image - model.render(ahead)
-            settled, left = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
+        while (parts := np.array(PARTS)[tries]).any():
+            ahead = _move(model, state, amplitude, names, parts[owners] * newton, changes)
+            light = model.render(ahead)
+            settled, left = _explain_rest(
+                model, model.image - light, excess, scale, MOVED_FREE_ITERATIONS
+            )
             if compute_objective(model, left) < before:
                 moved, free, rest = ahead, ahead + settled, left
                 break
+            lost = share_misfit(model, ahead, light, model.weights * (left**2 - rest**2))
+            losses = np.bincount(model.surface, lost, parts.size) * (parts > 0)
+            further = ~(losses <= SHORTENING_LOSS * losses.max()) | (losses.max() <= 0)
+            tries = np.minimum(tries + further, len(PARTS) - 1)
         else:
             model.place(state)
     numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
@@ -584,9 +603,10 @@ def _differentiate_priors(
     """Second and first derivative of what is known of bending and sweep beforehand."""
     second, first = np.zeros((len(names), len(names))), np.zeros(len(names))
     centres = [index for index, (name, _, _) in enumerate(names) if name == "centres"]
-    weights = weigh_centres(model.camera)
-    second[np.ix_(centres, centres)] = weights
-    first[centres] = weights @ model.state.centres
+    if centres:
+        weights = weigh_centres(model.camera)
+        second[np.ix_(centres, centres)] = weights
+        first[centres] = weights @ model.state.centres
     for index, (name, surface, number) in enumerate(names):
         if name == "coefficients":
             bending = model.bases[surface].bending[number]
