@@ -40,7 +40,7 @@ from tofclip.solvers import Progress, ignore_progress
 from tofclip.threads import limit_blas_threads
 
 START_ITERATIONS = 25
-MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 5, 10
+MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 6, 10
 AGAINST_DIM = 3.0  # until ranges are known; then amplitudes are as the shot has them
 # What dim light costs, in deviations, and for how many iterations at most, where it is to stay only as
 # the shot needs it: first it gives way, then what is needed comes back. Fewer after the first shot.
@@ -391,8 +391,10 @@ def _refine(
         if number + 1 >= MIN_REFINEMENTS:
             if far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
                 break
-            if number + 1 < MAX_REFINEMENTS:
-                settle_surfaces(solver, far > LONG_STEP_SIGMAS**2 * points)
+            alone = far > LONG_STEP_SIGMAS**2 * points
+            # where most of a scene moves, it may be the instrument that is not known yet
+            if number + 1 < MAX_REFINEMENTS and 2 * points[alone].sum() < points.sum():
+                settle_surfaces(solver, alone)
     assert found is not None
     return found, extrapolate_steps(np.array(lengths))
 
