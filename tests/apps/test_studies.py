@@ -234,6 +234,13 @@ class TestStudies:
         found = score_methods(SCENES[name](), make_scene_instrument(name, 50), 21, fit=False)
         assert found["surfaces"].figures["image_nmse"] < worst
 
+    @pytest.mark.nightly
+    def test_a_plate_of_which_frames_show_a_corner_is_found(self):
+        """Turned far and dim: 0.98 of the scene are within a bin, 0.90 where the fit of a corner stood for it."""
+        name = "slanted and curved"
+        found = score_methods(SCENES[name](), make_scene_instrument(name, 200), 4, fit=False)
+        assert found["surfaces"].figures["share_within_one_bin"] > 0.95
+
 
 class TestReproduce:
     @pytest.mark.nightly  # half a minute; tests of sequences run a quick study through this folder

@@ -257,19 +257,18 @@ def join_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
     follow these take the table's light for theirs.
     """
     doubles = _list_doubles(solver)
-    if not doubles:
-        return solver
-    solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
-    before = _measure_misfit(solver)
     while doubles:
-        large, small = doubles.pop(0)
+        pair = doubles.pop(0)
+        apart, own = _take_apart(solver, pair), int(pair[0] > pair[1])
+        apart.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
         # where the smaller is far off, the larger alone is the better guess
-        trials = [_join(solver, large, small, like) for like in ([large, small], [large])]
-        for trial in trials:
+        trials = [apart, *(_join(apart, own, 1 - own, like) for like in ([0, 1], [own]))]
+        for trial in trials[1:]:
             trial.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
-        left = [_measure_misfit(trial) for trial in trials]
-        if min(left) < before:
-            before, solver = min(left), trials[int(np.argmin(left))]
+        best = int(np.argmin([_measure_misfit(trial) for trial in trials]))
+        if best:
+            solver = _join(solver, *pair, [*pair][: 3 - best])
+            solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
             doubles = _list_doubles(solver)
     return solver
 
@@ -365,7 +364,7 @@ def straighten_surfaces(
         # one that is bent for certain takes light from others: these are tried again without it
         least = max(1.0, min(max(needed), NO_DOUBT) / CERTAINLY_BENT)
         straight = [one for one, need in zip(straight, needed, strict=True) if need <= least]
-    return solver, replace(before, free=None)
+    return AmplitudeSolver(ahead, before.amplitude, solver.weight, solver), before
 
 
 def _refine(

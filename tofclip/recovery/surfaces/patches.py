@@ -61,6 +61,9 @@ CREASE_BINS, CREASE_SIGMAS, CREASE_FRACTION, CREASE_ROUNDS = 0.4, 0.67, 0.5, 8
 MIN_ROUND_PX = 50  # of a surface of second order in space: any few returns lie on one
 EVIDENCE_ROUNDS = 2
 SPLINE_START_PENALTY, SPLINE_FLOOR = 1e-5, 1e-9  # per return, before the bending is known
+# Of a patch's returns, for it to be a part of its surface alone; returns that are nearer to another's
+# surface may be that one's.
+GROWTH, APART_BINS = 2.0, 15.0
 CORRELATED_PX = 30  # returns of a frame recovery that share their errors, about
 
 
@@ -382,6 +385,47 @@ def _give_splines(patch: Patch) -> Patch:
         usual = float(np.mean((differences @ coefficients) ** 2)) + TINY
         penalty = scale**2 * CORRELATED_PX * bending / usual + floor
     return replace(patch, basis=replace(basis, bending=bending / usual), coefficients=coefficients)
+
+
+def extend_patches(patches: list[Patch], returns: Returns, bin_m: float) -> list[Patch]:
+    """Give patches whose returns scatter those beside them that lie on their surfaces as well and on no
+    other's, the brightest of their pixels or not, where these are many: of a dim surface that is turned far
+    frames may show a corner alone without gaps, and what fits a corner is many bins off elsewhere.
+    """
+    if not patches:
+        return patches
+    pixel = returns.y.astype(np.intp) * patches[0].ray_length.shape[1] + returns.x
+    near = np.array([np.isin(pixel, patch.pixels) for patch in patches])
+    for patch, own in zip(patches, near, strict=True):
+        off = returns.range[own] - patch.compute_ranges(pixel[own])
+        own[own] = np.abs(off) < APART_BINS * bin_m
+    elsewhere = near.sum(axis=0) - near > 0
+    distance, deviation = (one.astype(np.float64) for one in (returns.range, returns.confidence))
+    return [
+        _extend(patch, pixel[free], distance[free], deviation[free], bin_m)
+        if patch.compute_error() > MERGE_BINS * bin_m
+        else patch
+        for patch, free in zip(patches, ~elsewhere, strict=True)
+    ]
+
+
+def _extend(
+    patch: Patch, pixels: Pixels, distance: FloatArray, deviation: FloatArray, bin_m: float
+) -> Patch:
+    size, grown = 0, patch
+    while grown.pixels.size > size:
+        size, seen = grown.pixels.size, np.zeros(patch.ray_length.shape, bool)
+        seen.ravel()[grown.pixels] = True
+        beside = scipy.ndimage.binary_dilation(seen, np.ones((NEIGHBOURS_PX,) * 2))
+        off = np.abs(distance - grown.compute_ranges(pixels))
+        most = max(NEIGHBOUR_BINS * bin_m, SPLIT_SIGMAS * grown.compute_error())
+        own = np.flatnonzero(beside.ravel()[pixels] & (off < most))
+        own = own[np.argsort(off[own])]
+        _, nearest = np.unique(pixels[own], return_index=True)
+        own = own[nearest]
+        if own.size > size:
+            grown = _fit_quadratic(pixels[own], distance[own], deviation[own], patch.ray_length)
+    return patch if size < GROWTH * patch.pixels.size else _bend_where_needed(grown, bin_m)
 
 
 def find_dimmer_patches(

@@ -285,7 +285,7 @@ class NormalEquations:
                 # a cluster may say nothing of some
                 place = np.searchsorted(part, self.clusters[number].numbers[own])
                 whole = self.clusters[number].information
-                information[np.ix_(place, place)] = whole[np.ix_(own, own)]
+                information[place[:, np.newaxis], place] = whole[own[:, np.newaxis], own]
             leverage, axes = np.linalg.eigh(factor.T @ said @ factor)
             left = np.sqrt(1 - np.clip(leverage, 0, MAX_LEVERAGE))
             along = influence[np.ix_(says, part)] @ inverse_factor.T

@@ -24,6 +24,7 @@ from tofclip.recovery.surfaces.model import (
 from tofclip.recovery.surfaces.patches import (
     MARGIN_PX,
     Patch,
+    extend_patches,
     find_dimmer_patches,
     find_patches,
     find_plain_patches,
@@ -152,7 +153,8 @@ def find_brightest_patches(returns: Returns, ray_length: FloatArray, bin_m: floa
     """Patches of each pixel's strongest return: weaker ones are often the frames' own, and would widen
     the surfaces.
     """
-    return find_patches(*_list_strongest(returns), ray_length, bin_m)
+    found = find_patches(*_list_strongest(returns), ray_length, bin_m)
+    return extend_patches(found, returns, bin_m)
 
 
 def _list_strongest(returns: Returns) -> tuple[Pixels, FloatArray, FloatArray]:
