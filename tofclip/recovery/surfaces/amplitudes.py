@@ -24,6 +24,8 @@ NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a p
 # and in which the brightest counts, the part of that below which a place is dim, and after how many
 # iterations what is dim is looked for anew
 PLACE_PX, BESIDE_PX, DIM_PART, REWEIGHT_ITERATIONS = 3, 15, 0.75, 10
+# Of the deviations by which the brightest is out of the noise: what dim light costs at most
+CAPPED_COST = 0.5
 # Deviations of a pixel's noise: iterations that change each surface by less, root mean square, are enough
 SETTLED_SIGMAS = 0.003
 MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
@@ -162,13 +164,14 @@ class AmplitudeSolver:
 
     def _cost_dim(self, sigmas: float, noise: Image) -> Image:
         """What light costs at each point for being dimmer than the brightest of its surface beside it:
-        so many deviations, `noise`, where it is dark, but no more than the brightest is out of the noise
-        itself: in little light nothing would be left.
+        so many deviations, `noise` of the gradient, where it is dark, but no more than half of those
+        by which the brightest is out of it: in little light nothing would be left.
         """
         bright, brightest = self.compare_places()
         usual = np.maximum(np.float32(DIM_PART) * brightest, TINY)
         dim = np.clip(1 - bright / usual, 0, 1)
-        return np.asarray(dim * noise * np.minimum(np.float32(sigmas), noise * usual))
+        out = CAPPED_COST * noise * usual / np.float32(self.variance)
+        return np.asarray(dim * noise * np.minimum(np.float32(sigmas), out))
 
     def compare_places(self) -> tuple[Image, Image]:
         """How bright the place of each point is, and the brightest of its surface beside it."""

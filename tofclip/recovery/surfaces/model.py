@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, estimate_dark_level
 from tofclip.lidar import compute_ray_directions
+from tofclip.recovery.defects import estimate_noise
 from tofclip.recovery.surfaces.patches import MIN_BEHIND_FRACTION
 from tofclip.recovery.surfaces.pulse import (
     EXTENT_SIGMAS,
@@ -48,6 +49,7 @@ Result = TypeVar("Result")
 Box = tuple[NDArray[np.int64], slice]  # rows, ascending, and columns
 
 MODEL_ERROR_FRACTION = 0.015  # of the brightest measurement: what the model leaves without noise
+DARK_VARIANCES = 2.0  # of the dark: dark measurements hold more of what the model lacks
 SMOOTHING_PX = 2.0
 SLIT_PIXELS = 4
 # Rows that a part of a pixel spans where a surface is turned far, and parts along a side at most:
@@ -101,11 +103,13 @@ class SurfaceState:
 
 def weigh_measurements(streak: Streak, camera: Camera) -> tuple[Image, Image]:
     """Return the image above the dark level, and one over its variance; 0 where it is not valid."""
-    dark = estimate_dark_level(streak.counts)
-    image = (streak.counts - np.float32(dark)).astype(np.float32)
-    smooth = np.maximum(scipy.ndimage.gaussian_filter(streak.counts.astype(np.float32), 1.0), 0)
+    image = (streak.counts - np.float32(estimate_dark_level(streak.counts))).astype(np.float32)
+    # what fluctuates in the dark, in the unit of the light's own variance: a camera may add any constant
+    _, noise, gain = estimate_noise(streak.counts)
+    dark = DARK_VARIANCES * noise**2 / gain
+    light = np.maximum(scipy.ndimage.gaussian_filter(image, 1.0), 0)
     # A measurement's variance is its photons; the floor stands for what the model cannot explain.
-    weights = 1 / (smooth + MODEL_ERROR_FRACTION * smooth.max() + max(dark, 0.0))
+    weights = 1 / (light + MODEL_ERROR_FRACTION * light.max() + dark)
     if streak.saturated is not None:
         weights[streak.saturated] = 0
     weights[:, camera.dead_columns] = 0
