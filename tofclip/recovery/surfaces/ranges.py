@@ -36,9 +36,9 @@ WIDTH_STEP = 0.02  # relative; for the derivative by a pulse's width
 CLUSTER_ROWS, CLUSTER_COLUMNS = 12, 48  # measurements whose misfits may depend on each other
 LEAST_VARIANCE = 1e-12  # of the largest one
 MAX_LEVERAGE = 0.9  # of a cluster: what it alone determines, its misfit says nothing about
-# Parts of a Gauss-Newton step that are tried until it lowers the misfit, then none; and of the most by
-# which a surface explains less than before, what shortens its step.
-PARTS, SHORTENING_LOSS = (1, 1 / 4, 1 / 16, 0), 0.1
+# Parts of a Gauss-Newton step that are tried until it lowers half the squared misfit, or raises it by so
+# little that it says nothing; how often; and what part of the most that a surface loses shortens its step.
+PARTS, SAYS_NOTHING, TRIES, SHORTENING_LOSS = (1, 1 / 4, 1 / 16, 0), 1.0, 6, 0.1
 # Rows by which each view's part of a sweep that was found from the shot is off: root mean squares of
 # scenes by a forward model of their own (0.015 and 0.05 in the demonstration). Later views and farther
 # surfaces look alike, so that the mean over the views is what all ranges have in common.
@@ -387,13 +387,14 @@ def refine_state(
     owners = np.array([one if name in ranges else len(model.parts) for name, one, _ in names])
     tries = np.zeros(len(model.parts) + 1, np.intp)
     with np.errstate(over="ignore", invalid="ignore"):
-        while (parts := np.array(PARTS)[tries]).any():
+        for _ in range(TRIES):
+            parts = np.array(PARTS)[tries]
             ahead = _move(model, state, amplitude, names, parts[owners] * newton, changes)
             light = model.render(ahead)
             settled, left = _explain_rest(
                 model, model.image - light, excess, scale, MOVED_FREE_ITERATIONS
             )
-            if compute_objective(model, left) < before:
+            if compute_objective(model, left) < before + SAYS_NOTHING:
                 moved, free, rest = ahead, ahead + settled, left
                 break
             lost = share_misfit(model, ahead, light, model.weights * (left**2 - rest**2))
