@@ -626,7 +626,7 @@ def test_light_of_a_level_line_gathers_where_dim_light_is_costly():
     lens = (model.surface == 0) & ~wire
     evenly, gathered = AmplitudeSolver(model, light, 2.0), AmplitudeSolver(model, light, 2.0)
     evenly.run(60)
-    gathered.run(60, against_dim=10.0)
+    gathered.run(90, against_dim=10.0)
     total = bright * wire.sum()
     # 0.35, none and 0.95 of it, with the noise of five seeds
     assert evenly.amplitude[lens].sum() > 0.3 * total
