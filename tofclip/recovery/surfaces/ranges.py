@@ -95,12 +95,13 @@ def iterate_derivatives(
     views = range(model.camera.views)
     others = [view for view in views if view != model.reference]
     surfaces = range(len(model.masks))
-    views_own = (
+    works = [
         (_differentiate_view, views),
         (_differentiate_sweep, others),
         (_differentiate_borders, range(1)),
-    )
-    for work, numbers in (*views_own * instrument, (_differentiate_surface, surfaces)):
+        (_differentiate_surface, surfaces),
+    ]
+    for work, numbers in works if instrument else works[-1:]:
         parts = model.map(partial(work, model, amplitude), numbers)
         yield from itertools.chain.from_iterable(parts)
 
