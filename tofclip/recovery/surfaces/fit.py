@@ -409,9 +409,10 @@ def settle_surfaces(solver: AmplitudeSolver, chosen: NDArray[np.bool_]) -> None:
         step = refine_state(apart.model, apart.amplitude, step, instrument=False)
         apart.amplitude = step.amplitude
         apart.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
-    state, found = model.state.copy(), iter(apart.model.state.coefficients)
-    for surface in np.flatnonzero(chosen):
-        state.coefficients[surface] = next(found)
+    state = model.state.copy()
+    found = zip(np.flatnonzero(chosen), apart.model.state.coefficients, strict=True)
+    for surface, coefficients in found:
+        state.coefficients[surface] = coefficients
     model.place(state)
     solver.amplitude[chosen[model.surface]] = apart.amplitude
 
