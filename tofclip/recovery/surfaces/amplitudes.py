@@ -101,7 +101,7 @@ class AmplitudeSolver:
         over the light, (surfaces,).
         """
         model, amplitude = self.model, self.amplitude
-        information = np.maximum(self.variance * model.gather(model.weights, squared=True), 0)
+        information = np.maximum(model.gather(model.weights, squared=True) / self.variance, 0)
         light, out = (
             np.bincount(model.surface, one, len(model.parts))
             for one in (amplitude, amplitude**2 * np.sqrt(information))
@@ -157,7 +157,7 @@ class AmplitudeSolver:
             ahead = moved + np.float32((age - 1) / older) * change
             self.amplitude, age = moved, older
             tick()
-            squares = np.bincount(model.surface, (change * deviation) ** 2)
+            squares = np.bincount(model.surface, (change * deviation / self.variance) ** 2)
             if np.all(squares <= SETTLED_SIGMAS**2 * sizes):
                 break
         self.variance = estimate_excess_variance(model, self.amplitude)
