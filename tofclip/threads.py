@@ -12,7 +12,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import copy_context
 from functools import lru_cache
@@ -91,15 +91,29 @@ def map_parallel(
     if threads == 1:
         yield from map(work, jobs)
         return
-    with open_worker_pool(threads) as pool:
-        pending: deque[Future[Result]] = deque()
-        for job in jobs:
-            # in the caller's context: NumPy keeps there which faults are ignored
-            pending.append(pool.submit(copy_context().run, work, job))
-            if len(pending) > (lookahead or threads):
+    pool, pending = _keep_pool(threads), deque[Future[Result]]()
+    with limit_blas_threads():
+        try:
+            for job in jobs:
+                # in the caller's context: NumPy keeps there which faults are ignored
+                pending.append(pool.submit(copy_context().run, work, job))
+                if len(pending) > (lookahead or threads):
+                    yield pending.popleft().result()
+            while pending:
                 yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
+        finally:
+            wait([one for one in pending if not one.cancel()])
+
+
+def _keep_pool(threads: int) -> Executor:
+    """Return the calling thread's workers, which stay: to begin some for each map took as long as a
+    small map itself. A forked process has none of them.
+    """
+    known = os.getpid(), threads
+    if getattr(_worker, "known", None) != known:
+        _worker.known, _worker.pool = known, ThreadPoolExecutor(threads, "tofclip", _mark_worker)
+    pool: Executor = _worker.pool
+    return pool
 
 
 def split_blocks(total: int, size: int = LANES) -> Iterator[slice]:
