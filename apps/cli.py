@@ -33,7 +33,7 @@ from typer.core import TyperCommand, TyperGroup, TyperOption
 from apps.progress import silence
 from apps.report import name_options, replace_results
 from tofclip.errors import InputError, TofclipError
-from tofclip.files import describe_missing_package
+from tofclip.files import DISK_IS_FULL, describe_missing_package
 from tofclip.version import __version__
 
 PROGRAM = "tofclip"
@@ -474,9 +474,10 @@ def _interrupt_again(lost: Any) -> None:
 
 def _report_error(fault: Exception) -> int:
     """Print one line about an error and return the exit status."""
-    if isinstance(fault, BrokenPipeError):
+    if isinstance(fault, OSError) and fault.errno in (errno.EPIPE, errno.ENOSPC):
         # Python flushes once more at exit; let that go nowhere instead of failing again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if isinstance(fault, BrokenPipeError):
         return EXIT_BROKEN_PIPE
     message, status = _describe_unusable_input(fault), EXIT_INPUT_ERROR
     if message is None:
@@ -494,6 +495,8 @@ def _describe_unusable_input(fault: Exception) -> str | None:
         return name_options(str(fault))
     if isinstance(fault, MemoryError):
         return f"this computer's memory does not suffice: {fault}"
+    if isinstance(fault, OSError) and fault.errno == errno.ENOSPC:  # of files, their writers say it
+        return f"standard output: cannot be written: {DISK_IS_FULL}"
     if isinstance(fault, OSError) and fault.errno in UNUSABLE_NAMES:
         return f"a name cannot be used: {fault.strerror} ({fault.filename})"
     return describe_missing_package(fault) if isinstance(fault, ImportError) else None

@@ -169,7 +169,7 @@ def report(
     plain = {
         name: value
         for name, value in plain.items()
-        if value not in (None, "") and name not in json_only
+        if value not in (None, "", [], {}) and name not in json_only
     }
     width = max(map(len, plain), default=0)
     compared = _find_compared(plain)

@@ -74,7 +74,7 @@ def _draw_figure(volume: Volume) -> Figure:
         title, labels = "front: from the wall", ("x (m)", down)
         drawn = _draw_picture(front, title, seen.max(axis=0), (x, y), labels)
         figure.colorbar(drawn, ax=views, label="relative brightness", aspect=30, **bar)
-        title = f"depth above {DEPTH_THRESHOLD:.0%} about it"
+        title = f"depth above {DEPTH_THRESHOLD:.0%} of its layers' peak"
         drawn = _draw_picture(depth_map, title, map_depths(volume), (x, y), labels, None)
         drawn.set_cmap(DEPTH_COLOUR_MAP)
         nearest, furthest = drawn.get_clim()

@@ -123,8 +123,8 @@ class Grid:
             far = middle + min(float(capture.axis.paths[-1]) / 2, MAX_DEPTH_WALL_WIDTHS * width)
         if far < near:
             raise InputError(
-                f"no room for a hidden scene: z would run from {near:.3g} to {far:.3g} m; does the record "
-                f"(paths up to {capture.axis.paths[-1]:.3g} m) start at the right time?"
+                f"no room for a hidden scene: z would run from {near:.3g} to {far:.3g} m before a wall {width:.3g} m "
+                f"wide; are wall, laser and start in m, and bins in s (paths up to {capture.axis.paths[-1]:.3g} m)?"
             )
         return cls.box((low[0], high[0]), (low[1], high[1]), (near, far), voxel)
 

@@ -79,7 +79,7 @@ def pytest_sessionfinish():
 STRICT = "TOFCLIP_KNOWN_SKIPS_ONLY" in os.environ
 
 KNOWN_SKIPS = {
-    "": r"^no (recorded|clip pictures|/)|Aravis|Swabian|iverilog|kiss_icp|bm3d|matrix registers|"
+    "": r"^no (recorded|clip pictures|/)|Aravis|Swabian|kiss_icp|bm3d|matrix registers|"
     "there is a graphics processor",
     "torch": "torch|PyTorch|another device than NumPy's",
     "browser": "chromium",

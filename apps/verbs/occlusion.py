@@ -55,7 +55,7 @@ def region(
         "inactive_length_m": found.length if found.is_bounded or as_json else "without end",
         "promised": "seen beyond the inactive length"
         if found.is_bounded
-        else "nothing: the occluder is as wide as the baseline",
+        else "nothing: the occluder is no narrower than the baseline",
     }
     report(figures, as_json, [] if out is None else [out])
 

@@ -194,7 +194,13 @@ def photons(
     }
     if doubt := find_doubt(image, found.settings, cycles):
         say("warning", doubt)
-    report(figures, as_json, [out])
+    assumed = []
+    if camera is None and time_zero is None and not first_time:
+        assumed.append("ranges are right up to a constant (--time-zero-ns)")
+    if camera is None and focal_length_px is None and suffix in POINT_SUFFIXES:
+        view = f"a view of {field_of_view_deg:g} degrees (--field-of-view-deg)"
+        assumed.append(f"widths and heights are those of {view}")
+    report(figures, as_json, [out], "; ".join(assumed))
 
 
 def find_doubt(

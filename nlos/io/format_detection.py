@@ -139,6 +139,7 @@ def list_capture_arrays(path: Path, start: bytes) -> NamedArrays | None:
 
 
 def _read_archive(path: Path) -> Capture:
+    """Read a capture of NumPy's arrays, or a streak image of LIFT that brings its relay wall."""
     archive = NamedArrays(path)
     if "streak_raw" in archive:
         return labs.read_lift_archive(path)
@@ -146,10 +147,12 @@ def _read_archive(path: Path) -> Capture:
 
 
 def _read_hdf5(path: Path) -> Capture:
+    """Read a capture or recovered frames of our own, or a capture of y-tal or of Zaragoza."""
     return read_native(path) or _read_fields(read_hdf5(path), HDF5_FORMATS)
 
 
 def _read_matlab(path: Path) -> Capture:
+    """Read a capture of MATLAB's arrays, as eight laboratories publish theirs."""
     return _read_fields(read_matlab(path), MATLAB_FORMATS)
 
 

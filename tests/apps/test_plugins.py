@@ -196,6 +196,7 @@ def test_instruments_of_a_package_are_found(package):
 
 def test_what_is_wrong_with_a_package_is_a_line(package, shell):
     listed = shell.figures("plugins")["parts"]
+    assert all(one["meaning"] for one in listed if one["origin"] == "tofclip")
     own = {(one["name"], one["fault"]) for one in listed if one["origin"] == "mine 1.0"}
     names, faults = [name for name, _ in own], [fault for _, fault in own if fault]
     assert sorted(names) == ["broken"] * 3 + ["half", "mine", "nlm", "texts"]

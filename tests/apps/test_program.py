@@ -140,6 +140,10 @@ sys.exit(cli.main(sys.argv[1:]))
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
         assert "copy.h5: cannot be written" in done.stderr
         assert list(tmp_path.iterdir()) == []
+        with open("/dev/full", "w") as full:
+            words = [*PROGRAM, "info", files / "camera.h5"]
+            done = subprocess.run(words, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, check=False)
+        assert (done.returncode, done.stderr.count(b"\n")) == (2, 1)
 
     @pytest.mark.parametrize("verb", READERS)
     def test_a_missing_file_is_refused_before_anything_else(self, shell, verb):

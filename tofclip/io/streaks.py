@@ -30,6 +30,7 @@ from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance, read_out
 
 @contextlib.contextmanager
 def _open_own(path: str | Path) -> Iterator[StreakFile]:
+    """Open a streak image of our own, HDF5."""
     yield partial(read_outline, path), partial(Streak.load, path)
 
 
@@ -44,6 +45,7 @@ def _make_reader(
         with open_file(path) as (outline, _):
             return outline()
 
+    read.__doc__ = open_file.__doc__  # `tofclip plugins` shows it
     return Reader(signatures, read, describe)
 
 
