@@ -182,22 +182,12 @@ def follow_surfaces(
         patches += find_dimmer_patches(patches, shown, ray_length, model.row_m)
         if not patches:
             return None
-        shapes = [patch.coefficients for patch in patches]
+        masks, amplitude = lay_out(patches, shown, light, model.row_m, FOLLOWING_MARGIN_PX)
         even = np.zeros((len(patches), camera.views))
+        shapes = [patch.coefficients for patch in patches]
         state = replace(model.state, coefficients=shapes, shading=even)
-        solver = lay_out(
-            patches,
-            shown,
-            light,
-            streak,
-            camera,
-            state,
-            model.pulse,
-            weight,
-            model.row_m,
-            FOLLOWING_MARGIN_PX,
-        )
-        model, limit = solver.model, MAX_UNEXPLAINED
+        model, limit = model.lay_out(masks, [p.basis for p in patches], state), MAX_UNEXPLAINED
+        solver = AmplitudeSolver(model, amplitude, weight)
         remainder = np.zeros(len(patches))
         begun = replace(
             begun, explained=np.zeros((ROUND_COEFFICIENTS, model.surface.size), np.float32)

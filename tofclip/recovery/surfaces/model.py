@@ -18,7 +18,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 from typing import Any, NamedTuple, TypeVar
 
@@ -270,31 +270,48 @@ class SurfaceModel:
         self.outer = np.flatnonzero(np.isin(self.column, [0, masks.shape[2] - 1]))
         self.behind = np.zeros(self.surface.size, bool)
 
-    def cover(self, masks: NDArray[np.bool_]) -> SurfaceModel:
-        """Return the same surfaces, each where its mask is; those without any are left out."""
-        other, left = copy.copy(self), np.flatnonzero(masks.any(axis=(1, 2)))
-        behind = np.zeros(masks.shape, bool)
-        behind[self.masks] = self.behind
-        other._cover(masks[left], [self.bases[surface] for surface in left])
-        other.behind = behind[left][other.masks]
-        state = self.state.copy()
-        state.coefficients = [state.coefficients[surface] for surface in left]
-        state.shading = state.shading[left]
+    def lay_out(
+        self,
+        masks: NDArray[np.bool_],
+        bases: Sequence[SmoothBasis],
+        state: SurfaceState,
+        behind: NDArray[np.bool_] | None = None,
+    ) -> SurfaceModel:
+        """Return a model of other surfaces before the same shot; `behind` (surfaces, rows, columns): which
+        points are seen through another surface.
+        """
+        other = copy.copy(self)
+        other._cover(masks, bases)
+        if behind is not None:
+            other.behind = behind[masks]
         other.place(state)
         return other
+
+    def _draw_behind(self, surfaces: int) -> NDArray[np.bool_]:
+        """Where points lie behind another surface, (surfaces, rows, columns)."""
+        behind = np.zeros((surfaces, *self.masks.shape[1:]), bool)
+        behind[self.surface, self.row, self.column] = self.behind
+        return behind
+
+    def cover(self, masks: NDArray[np.bool_]) -> SurfaceModel:
+        """Return the same surfaces, each where its mask is; those without any are left out."""
+        left, state = np.flatnonzero(masks.any(axis=(1, 2))), self.state.copy()
+        bases, shapes = (
+            [of[surface] for surface in left] for of in (self.bases, state.coefficients)
+        )
+        state = replace(state, coefficients=shapes, shading=state.shading[left])
+        return self.lay_out(masks[left], bases, state, self._draw_behind(len(masks))[left])
 
     def add(self, masks: NDArray[np.bool_], inverse: FloatArray) -> SurfaceModel:
         """Return the same surfaces, and behind them others whose inverse depths are known, 1/m; both
         (surfaces, rows, columns).
         """
-        other, state, hidden = copy.copy(self), self.state.copy(), self.behind
         known = [KnownBasis(self.camera.image_shape, inverse=one) for one in inverse]
-        other._cover(np.concatenate([self.masks, masks]), [*self.bases, *known])
-        other.behind[: hidden.size] = hidden
-        state.coefficients += [np.ones(1)] * len(known)
-        state.shading = np.pad(state.shading, ((0, len(known)), (0, 0)))
-        other.place(state)
-        return other
+        shapes = [*self.state.coefficients, *([np.ones(1)] * len(known))]
+        shading = np.pad(self.state.shading, ((0, len(known)), (0, 0)))
+        state = replace(self.state.copy(), coefficients=shapes, shading=shading)
+        masks = np.concatenate([self.masks, masks])
+        return self.lay_out(masks, [*self.bases, *known], state, self._draw_behind(len(masks)))
 
     def _evaluate(self, pixel: NDArray[np.intp]) -> list[FloatArray]:
         """The functions of each surface's basis, at one pixel for each point."""

@@ -46,7 +46,7 @@ MERGE_REACH_BINS, MERGE_REACH_MISFITS = 7.0, 5.0
 # Of returns, also in their deviations: further off a patch's surface they may be another's.
 SPLIT_BINS, SPLIT_SIGMAS = 4.0, 3.0
 MERGE_SIGMAS = 1.0  # median; 0.67 are expected of returns of the surface
-FIT_ITERATIONS = 10
+FIT_ITERATIONS, SETTLED_SCALE = 10, 0.003  # at most, until the errors' scale changes by less
 FITTED_RETURNS = 2000  # of a patch, evenly chosen: with more a start is no better
 RIDGE = 1e-9  # per return: those along a line say nothing about what is across it
 CURVATURE_PENALTY = 1e-3  # keeps small patches from bending
@@ -153,13 +153,10 @@ def _split(patch: Patch, bin_m: float) -> list[Patch]:
         off = np.abs(flat.compute_ranges(part.pixels) - part.distance)
         far = off > np.maximum(SPLIT_BINS * bin_m, SPLIT_SIGMAS * part.deviation)
         if far.sum() >= MIN_DIMMER_PX and not far.all():
+            large = [p for p in _split(part.take(far), bin_m) if p.pixels.size >= MIN_DIMMER_PX]
             # what splines follow is the rim of a round surface
-            whole = _bend_where_needed(part, bin_m)
-            apart = [
-                one
-                for one in _split(part.take(far), bin_m)
-                if one.pixels.size >= MIN_DIMMER_PX and _stands_apart(one, whole, bin_m)
-            ]
+            whole = _bend_where_needed(part, bin_m) if large else part
+            apart = [one for one in large if _stands_apart(one, whole, bin_m)]
         if apart:
             left = ~np.isin(part.pixels, np.concatenate([one.pixels for one in apart]))
             found += [*apart, *_split(part.take(left), bin_m)]
@@ -248,8 +245,10 @@ def _fit_robustly(
     for _ in range(FIT_ITERATIONS):
         normal = design.T @ (design * weights[:, np.newaxis]) + penalty * weights.mean()
         coefficients = np.linalg.solve(normal, design.T @ (weights * values))
-        error = values - design @ coefficients
+        error, before = values - design @ coefficients, scale
         scale = max(1.4826 * float(np.median(np.abs(error))), TINY)
+        if abs(scale - before) < SETTLED_SCALE * before:
+            break
         weights = 1 / (1 + (error / (2 * scale)) ** 2)
     return coefficients, scale
 

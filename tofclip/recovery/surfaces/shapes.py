@@ -29,6 +29,10 @@ LINEAR = 3  # of these
 ROUND_COEFFICIENTS = LINEAR + COEFFICIENTS  # of a surface of second order in space
 SPLINE_DEGREE = 3
 TINY = float(np.finfo(np.float32).eps)
+# Derivatives of monomials, as in `evaluate_monomials`, along x and y: sums of these.
+BY_X, BY_Y = np.zeros((2, COEFFICIENTS, COEFFICIENTS))
+BY_X[[0, 1, 2], [1, 3, 4]] = 1, 2, 1
+BY_Y[[0, 1, 2], [2, 4, 5]] = 1, 1, 2
 # Of the change of q over a pixel: the mean of sqrt(q) over what a pixel at the limb sees of a surface
 # is sqrt(q) at the pixel's middle, of which as much is rounded off.
 LIMB = 0.44
@@ -150,11 +154,10 @@ class QuadricBasis(SmoothBasis):
         return np.asarray(functions[:, :LINEAR] @ coefficients[:LINEAR] + self.sign * root)
 
     def differentiate(self, functions: FloatArray, coefficients: FloatArray) -> FloatArray:
-        inside, size, change, slopes, ways = self._round_off(functions, coefficients)
-        across, down = (slope[:, None] * way for slope, way in zip(slopes, ways, strict=True))
-        by_limb = LIMB * (across + down) / change[:, None]
+        inside, size, slopes = self._round_off(functions, coefficients)
+        by_limb = sum(slope[:, None] * (functions @ way) for slope, way in slopes)
         by_q = (inside / size)[:, None] * (2 * self.unit * functions)
-        by_q += (LIMB * change / size)[:, None] * by_limb
+        by_q += (LIMB**2 / size)[:, None] * by_limb
         by_q /= (4 * np.sqrt(inside / 2))[:, None]
         return np.concatenate([functions[:, :LINEAR], self.sign * by_q], axis=1)
 
@@ -184,21 +187,17 @@ class QuadricBasis(SmoothBasis):
 
     def _round_off(self, functions: FloatArray, coefficients: FloatArray) -> tuple[Any, ...]:
         """Twice the square of the root, which is q inside and rounded off at the limb; its size there;
-        by how much q changes over a pixel; its slopes, and their derivatives by q's coefficients.
+        and the slopes of q, each with what makes of monomials its derivatives by q's coefficients.
         """
-        own, functions = coefficients[LINEAR:], 2 * self.unit * functions
-        q = functions @ own
-        one, x, y = functions[:, :LINEAR].T
-        none, (high, wide) = np.zeros_like(x), self._measure_box()
-        right = np.stack([none, one, none, 2 * x, y, none], axis=-1) * (2 / wide)
-        down = np.stack([none, none, one, none, x, 2 * y], axis=-1) * (2 / high)
-        slopes = right @ own, down @ own
-        change = np.hypot(*slopes) + np.finfo(np.float64).tiny
-        limb = LIMB * change
+        own, (high, wide) = coefficients[LINEAR:], self._measure_box()
+        q = 2 * self.unit * (functions @ own)
+        ways = 4 * self.unit / wide * BY_X, 4 * self.unit / high * BY_Y
+        slopes = [(functions @ (way @ own), way) for way in ways]
+        limb = LIMB * np.hypot(*(slope for slope, _ in slopes)) + np.finfo(np.float64).tiny
         size = np.hypot(q, limb)
         # without the difference of large numbers beyond the limb
         inside = np.where(q > 0, q + size, limb**2 / (size + np.abs(q)))
-        return inside, size, change, slopes, (right, down)
+        return inside, size, slopes
 
 
 @dataclass(frozen=True)

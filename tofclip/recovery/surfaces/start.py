@@ -30,7 +30,7 @@ from tofclip.recovery.surfaces.patches import (
     find_plain_patches,
     reach_further,
 )
-from tofclip.recovery.surfaces.pulse import Image, ShotPulse, measure_pulse
+from tofclip.recovery.surfaces.pulse import Image, measure_pulse
 from tofclip.recovery.surfaces.shapes import Pixels
 from tofclip.shots import Frames, Returns, Streak
 from tofclip.units import SPEED_OF_LIGHT
@@ -83,9 +83,12 @@ def find_surfaces(found: Returns, streak: Streak, frames: Frames, weight: float)
         raise _refuse(f"{late:.0f} % of each pixel's light comes long after its peak")
 
     # 3. A surface may reach beyond its returns: measurements decide where it ends.
-    light = frames.values.sum(axis=0)
+    masks, amplitude = lay_out(patches, shown, frames.values.sum(axis=0), bin_m)
     state = SurfaceState.start([patch.coefficients for patch in patches], camera)
-    return lay_out(patches, shown, light, streak, camera, state, pulse, weight, bin_m)
+    bases = [patch.basis for patch in patches]
+    return AmplitudeSolver(
+        SurfaceModel(streak, camera, masks, bases, state, pulse), amplitude, weight
+    )
 
 
 def measure_rays(camera: Camera) -> FloatArray:
@@ -181,28 +184,18 @@ def _refuse(fault: str) -> InputError:
 
 
 def lay_out(
-    patches: list[Patch],
-    shown: Returns,
-    light: Image,
-    streak: Streak,
-    camera: Camera,
-    state: SurfaceState,
-    pulse: ShotPulse,
-    weight: float,
-    bin_m: float,
-    margin_px: int = MARGIN_PX,
-) -> AmplitudeSolver:
-    """Have points where patches and the returns of their surfaces are, and about them, each patch as
-    bright as its pixels; `light`: of these, (rows, columns).
+    patches: list[Patch], shown: Returns, light: Image, bin_m: float, margin_px: int = MARGIN_PX
+) -> tuple[NDArray[np.bool_], Image]:
+    """Say where points are, (surfaces, rows, columns): where patches and the returns of their surfaces are,
+    and about them; each patch is as bright as its pixels. `light`: of these.
     """
-    masks = np.zeros((len(patches), *camera.image_shape), bool)
+    masks = np.zeros((len(patches), *shown.camera.image_shape), bool)
     pictures = np.zeros(masks.shape, np.float32)
     for patch, mask, picture in zip(patches, masks, pictures, strict=True):
         picture.ravel()[patch.pixels] = light.ravel()[patch.pixels]
         reached = reach_further(patch, shown, bin_m)
         mask[...] = scipy.ndimage.binary_dilation(reached, np.ones((3, 3)), margin_px)
-    model = SurfaceModel(streak, camera, masks, [patch.basis for patch in patches], state, pulse)
-    return AmplitudeSolver(model, pictures[masks], weight)
+    return masks, pictures[masks]
 
 
 def estimate_darkness(streak: Streak, frames: Frames) -> float:
