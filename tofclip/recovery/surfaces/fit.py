@@ -370,41 +370,58 @@ def _refine(
         found = refine_state(model, solver.amplitude, found, number + 1 >= MIN_REFINEMENTS)
         solver.amplitude = found.amplitude
         solver.run(REFINEMENT_ITERATIONS, tick, AGAINST_DIM)
-        moved = model.distance - before
         # where a surface is dark, it may go anywhere
         light = solver.amplitude + np.finfo(np.float32).tiny
-        lengths.append([np.sqrt(np.average(moved[p] ** 2, weights=light[p])) for p in model.parts])
-        lit = solver.amplitude > 0
-        squares = np.where(lit, moved / model.estimate_deviation(found.covariances), 0) ** 2
-        far, points = (np.bincount(model.surface, one, len(model.parts)) for one in (squares, lit))
+        squares = (model.distance - before) ** 2
+        lengths.append([np.sqrt(np.average(squares[p], weights=light[p])) for p in model.parts])
+        far, points = _measure_step(solver, before, found)
         if number + 1 >= MIN_REFINEMENTS:
             if far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
                 break
             alone = far > LONG_STEP_SIGMAS**2 * points
             # where most of a scene moves, it may be the instrument that is not known yet
             if number + 1 < MAX_REFINEMENTS and 2 * points[alone].sum() < points.sum():
-                settle_surfaces(solver, alone)
+                settle_surfaces(solver, alone, found)
     assert found is not None
     return found, extrapolate_steps(np.array(lengths))
 
 
-def settle_surfaces(solver: AmplitudeSolver, chosen: NDArray[np.bool_]) -> None:
-    """Take further steps on the ranges of some surfaces, (surfaces,), alone: where one has far to go, as
-    a ball on a table, all others and the instrument have long been settled.
+def _measure_step(
+    solver: AmplitudeSolver, before: FloatArray, found: Refinement
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """How far ranges went of each surface, the sum of squares over its lit points in their deviations, and
+    how many these are, (surfaces,) each; `before`: ranges, (points,).
+    """
+    model, lit = solver.model, solver.amplitude > 0
+    moved = (model.distance - before) / model.estimate_deviation(found.covariances)
+    squares = np.where(lit, moved, 0) ** 2
+    far, points = (np.bincount(model.surface, one, len(model.parts)) for one in (squares, lit))
+    return far, points
+
+
+def settle_surfaces(solver: AmplitudeSolver, chosen: NDArray[np.bool_], found: Refinement) -> None:
+    """Take further steps on the ranges of some surfaces, (surfaces,), alone, after the step `found`: where
+    one has far to go, as a ball on a table, all others and the instrument have long been settled.
     """
     if not chosen.any():
         return
-    apart, step, model = _take_apart(solver, np.flatnonzero(chosen)), None, solver.model
+    model, own = solver.model, chosen[solver.model.surface]
+    apart = _take_apart(solver, np.flatnonzero(chosen))
+    step = replace(found, explained=found.explained[:, own], free=None)
     for _ in range(SETTLING_STEPS):
+        before = apart.model.distance
         step = refine_state(apart.model, apart.amplitude, step, instrument=False)
         apart.amplitude = step.amplitude
         apart.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        far, points = _measure_step(apart, before, step)
+        if far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
+            break
     state = model.state.copy()
-    found = zip(np.flatnonzero(chosen), apart.model.state.coefficients, strict=True)
-    for surface, coefficients in found:
+    shapes = zip(np.flatnonzero(chosen), apart.model.state.coefficients, strict=True)
+    for surface, coefficients in shapes:
         state.coefficients[surface] = coefficients
     model.place(state)
-    solver.amplitude[chosen[model.surface]] = apart.amplitude
+    solver.amplitude[own] = apart.amplitude
 
 
 def extrapolate_steps(lengths: FloatArray) -> FloatArray:

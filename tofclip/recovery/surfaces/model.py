@@ -296,9 +296,7 @@ class SurfaceModel:
     def cover(self, masks: NDArray[np.bool_]) -> SurfaceModel:
         """Return the same surfaces, each where its mask is; those without any are left out."""
         left, state = np.flatnonzero(masks.any(axis=(1, 2))), self.state.copy()
-        bases, shapes = (
-            [of[surface] for surface in left] for of in (self.bases, state.coefficients)
-        )
+        bases, shapes = [self.bases[k] for k in left], [state.coefficients[k] for k in left]
         state = replace(state, coefficients=shapes, shading=state.shading[left])
         return self.lay_out(masks[left], bases, state, self._draw_behind(len(masks))[left])
 

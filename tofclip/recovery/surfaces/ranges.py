@@ -378,12 +378,35 @@ def refine_state(
         pull = np.linalg.solve(weaker + RIDGE * np.eye(unit.size), first * swept / unit) / unit
         covariance += PULL_SIGMAS**2 * np.outer(pull, pull)
 
-    # 4. With as many iterations before the step as after it, so that these alone do not make it good.
-    # A step that is far too long may overflow: it is refused like others that lower nothing. Where
-    # surfaces explain less than before, these go less far, and do not hold the others back.
-    settled, left = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
-    before, state = compute_objective(model, left), model.state
-    moved, free, rest = amplitude, amplitude + settled, left
+    # 4. The step's length.
+    moved, free, rest = _take_step(model, amplitude, (excess, scale), names, newton, changes)
+    numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
+    own = [np.ix_(numbers == surface, numbers == surface) for surface in range(len(model.masks))]
+    covariances = [covariance[block] for block in own]
+    steps = 1 if earlier is None else earlier.steps + 1
+    model.weights = given
+    return Refinement(covariances, moved, changes, steps, rest, free)
+
+
+def _take_step(
+    model: SurfaceModel,
+    amplitude: Image,
+    begun: tuple[Image, Image],
+    names: list[Unknown],
+    newton: FloatArray,
+    changes: Image,
+) -> tuple[Image, Image, Image]:
+    """Move the model as far along a step as each surface's own misfit allows: those that explain less than
+    before go less far, and do not hold the others back. Return the amplitudes that go along, those that
+    explain the shot best then, and what is left of it. `begun`: what amplitudes change to explain it before
+    the step, and their scales.
+
+    There are as many iterations before the step as after it, so that these alone do not make it good. A
+    step that is far too long may overflow: it is refused like others that lower nothing.
+    """
+    state, error, (excess, scale) = model.state, model.image - model.render(amplitude), begun
+    settled, rest = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
+    before = compute_objective(model, rest)
     ranges = "coefficients", "patterns", "shading"
     owners = np.array([one if name in ranges else len(model.parts) for name, one, _ in names])
     tries = np.zeros(len(model.parts) + 1, np.intp)
@@ -392,24 +415,17 @@ def refine_state(
             parts = np.array(PARTS)[tries]
             ahead = _move(model, state, amplitude, names, parts[owners] * newton, changes)
             light = model.render(ahead)
-            settled, left = _explain_rest(
+            change, left = _explain_rest(
                 model, model.image - light, excess, scale, MOVED_FREE_ITERATIONS
             )
             if compute_objective(model, left) < before + SAYS_NOTHING:
-                moved, free, rest = ahead, ahead + settled, left
-                break
+                return ahead, ahead + change, left
             lost = share_misfit(model, ahead, light, model.weights * (left**2 - rest**2))
             losses = np.bincount(model.surface, lost, parts.size) * (parts > 0)
             further = ~(losses <= SHORTENING_LOSS * losses.max()) | (losses.max() <= 0)
             tries = np.minimum(tries + further, len(PARTS) - 1)
-        else:
-            model.place(state)
-    numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
-    own = [np.ix_(numbers == surface, numbers == surface) for surface in range(len(model.masks))]
-    covariances = [covariance[block] for block in own]
-    steps = 1 if earlier is None else earlier.steps + 1
-    model.weights = given
-    return Refinement(covariances, moved, changes, steps, rest, free)
+    model.place(state)
+    return amplitude, amplitude + settled, rest
 
 
 def doubt_borders(model: SurfaceModel, amplitude: Image) -> Image:
