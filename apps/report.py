@@ -232,18 +232,26 @@ def _format_compared(things: Mapping[str, Mapping[str, Any]]) -> str:
         for figure in next(iter(things.values()))
     ]
     text = _align_columns(cells)
-    fits = max(map(len, text.splitlines())) <= MAX_TABLE_WIDTH
-    return text if fits else _format_rows(things)
+    return text if _measure_width(text) <= MAX_TABLE_WIDTH else _format_rows(things)
 
 
 def _format_rows(things: Mapping[str, Mapping[str, Any]]) -> str:
-    """Put many things with few figures below each other: a line for each, indented."""
+    """Put many things with few figures below each other: a line for each, indented; or a column,
+    where lines are too long and columns are not as long.
+    """
     cells = [["  ", *map(_format_name, next(iter(things.values())))]]
     cells += [
         [f"  {_format_name(name)}", *map(_format_value, thing.values())]
         for name, thing in things.items()
     ]
-    return _align_columns(cells)
+    rows, columns = _align_columns(cells), _align_columns([*zip(*cells, strict=True)])
+    return (
+        rows if _measure_width(rows) <= MAX_TABLE_WIDTH else min(rows, columns, key=_measure_width)
+    )
+
+
+def _measure_width(text: str) -> int:
+    return max(map(len, text.splitlines()))
 
 
 def _align_columns(cells: Sequence[Sequence[str]]) -> str:

@@ -492,6 +492,7 @@ def info(
     middle = [axis[[0, -1]].mean() for axis in (grid.x, grid.y, grid.z)]
     pulse = VirtualPulse(found.wavelength or 0.0, found.cycles)
     paths = capture.axis.paths
+    usable = _find_usable_wavelengths(capture, grid, found.cycles)
     figures = {
         "wall": _describe_wall(capture),
         "laser": _describe_laser(capture),
@@ -502,10 +503,7 @@ def info(
             "first_path_m": paths[0],
             "last_path_m": paths[-1],
         },
-        "wavelength_mm": {
-            **_find_usable_wavelengths(capture, grid, found.cycles),
-            "chosen": shown["wavelength_mm"],
-        },
+        "wavelength_mm": {**usable, "chosen": shown["wavelength_mm"]},
         "gate": {"m": found.gate, "found": found.gate_found},
         "bins_together": found.bins_together,
         "method": found.method,
@@ -523,7 +521,11 @@ def info(
         report({**figures, "methods": suits | others}, as_json)
         return
     lines = {name: f"yes, {size:.0f} MiB" for name, size in mib.items()}
-    report({**figures, **lines, **{name: f"no: {one}" for name, one in refused.items()}}, as_json)
+    lines |= {name: f"no: {reason}" for name, reason in refused.items()}
+    note = ""
+    if shown["wavelength_mm"] < usable["shortest"]:
+        note = "the wall samples the shortest wavelength at every angle, the chosen one at that of the brightest light"
+    report({**figures, **lines}, as_json, note=note)
 
 
 def _describe_wall(capture: Capture) -> dict[str, Any]:

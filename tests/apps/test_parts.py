@@ -84,8 +84,13 @@ class TestReport:
                     "  2  0.2         yes",
                 ],
             ),
+            # lines too long for a terminal become columns
+            (
+                {"scenes": {name: dict.fromkeys(("f" * 50, "g" * 50), 1) for name in "ab"}},
+                ["scenes", f"{'':52}  a    b", f"{'f' * 50}  1    1", f"{'g' * 50}  1    1"],
+            ),
             # units stand behind their figures; what is not known is left out
-            ({"wall": {"width_m": 2.0, "gap_mm": None}}, ["wall  width 2 m"]),
+            ({"wall": {"width_m": 2.0, "gap_mm": None}, "none": {}}, ["wall  width 2 m"]),
             (
                 {"why": {"a": "x" * 60, "long_one": "y" * 60}},
                 ["why", f"  a         {'x' * 60}", f"  long one  {'y' * 60}"],
