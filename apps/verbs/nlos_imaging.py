@@ -351,19 +351,8 @@ def compare(
     if as_json:
         report({**shape, "methods": figures, "left_out": left_out}, as_json)
         return
-    lines = {name: _format_line(one) for name, one in figures.items()}
     reasons = {name: f"no: {reason}" for name, reason in left_out.items()}
-    report({**shape, **lines, **reasons}, as_json, written)
-
-
-def _format_line(figures: Mapping[str, Any]) -> str:
-    """Put a method's figures into columns that stand below those of other methods."""
-    memory = "" if figures["peak_mib"] is None else f"{figures['peak_mib']:7.0f} MiB"
-    line = f"{figures['seconds']:8.2f} s{memory}  correlation {figures['correlation']:6.3f}"
-    line += f"  sharpness {figures['sharpness']:5.2f}"
-    if "energy_near_truth" in figures:
-        line += f"  near truth {figures['energy_near_truth']:4.0%}  contrast {figures['contrast_to_truth']:5.1f}"
-    return line
+    report({**shape, **figures, **reasons}, as_json, written)
 
 
 @add_setting_flags(SceneSettings)
