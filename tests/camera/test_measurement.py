@@ -200,6 +200,8 @@ def test_some_rows_are_rectified_as_all_are(sweep):
 def test_what_cannot_be_measured_is_refused():
     with pytest.raises(CalibrationError, match="61 columns but the camera's slit has 64"):
         measure(streak(), None, camera(slit_width_px=64))
+    with pytest.raises(CalibrationError, match="or turn the picture"):
+        measure(streak(), None, camera(slit_width_px=ROWS))
     with pytest.raises(InputError, match="no measurement can be trusted"):
         measure(streak(), np.ones((ROWS, WIDTH), bool), camera())
     with pytest.raises(InputError, match="dark level"):

@@ -74,9 +74,10 @@ def require_width(counts: Float32Array, camera: Camera) -> None:
     `camera`.
     """
     if counts.shape[1] != camera.slit_width_px:
+        turned = ", or turn the picture" if counts.shape[0] == camera.slit_width_px else ""
         raise CalibrationError(
             f"the streak image has {counts.shape[1]} columns but the camera's slit has {camera.slit_width_px}; "
-            "use the camera file that belongs to this instrument"
+            f"use the camera file that belongs to this instrument{turned}"
         )
 
 
