@@ -19,7 +19,7 @@ from tofclip.recovery.surfaces.fit import (
     straighten_surfaces,
 )
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, weigh_measurements
-from tofclip.recovery.surfaces.patches import find_patches
+from tofclip.recovery.surfaces.patches import bend_patches, find_plain_patches
 from tofclip.recovery.surfaces.pulse import make_pulse
 from tofclip.recovery.surfaces.ranges import (
     CLUSTER_COLUMNS,
@@ -41,7 +41,8 @@ from tofclip.simulate import simulate_shot
 def find_patches_in(distance: np.ndarray, ray_length: np.ndarray):
     pixels = np.flatnonzero(np.isfinite(distance))
     sure = np.full(pixels.size, BIN_M / 10)
-    return find_patches(pixels, distance.ravel()[pixels], sure, ray_length, BIN_M)
+    plain = find_plain_patches(pixels, distance.ravel()[pixels], sure, ray_length, BIN_M)
+    return bend_patches(plain, BIN_M)
 
 
 def test_patches_are_planes_to_rounding_and_halves_of_one_are_joined():
@@ -165,7 +166,7 @@ def test_what_cannot_be_trusted_weighs_nothing(shot):
     dead = np.zeros(CAMERA.slit_width_px, bool)
     dead[[7, 200]] = True
     _, weights = weigh_measurements(
-        replace(streak, saturated=saturated), CAMERA.replace(dead_columns=dead)
+        replace(streak, saturated=saturated), CAMERA.replace(dead_columns=dead), dark=1.0
     )
     np.testing.assert_array_equal(weights == 0, saturated | dead)
 
@@ -507,7 +508,7 @@ def test_what_steps_take_from_the_misfit_is_given_back():
     rows, columns = 4 * CLUSTER_ROWS, 4 * CLUSTER_COLUMNS
     images = draw.standard_normal((7, rows, columns)).astype(np.float32)
     images *= np.repeat(np.repeat(draw.uniform(0, 1, (7, 4, 4)) ** 2, 12, 1), 48, 2)
-    group = Derivatives([("coefficients", 0, number) for number in range(7)], 0, 0, images)
+    group = Derivatives(0, 0, images, [("coefficients", 0, number) for number in range(7)])
     weights = np.ones((rows, columns), np.float32)
     flat = images.reshape(7, -1).astype(np.float64)
     inverse = np.linalg.inv(flat @ flat.T)

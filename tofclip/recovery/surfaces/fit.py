@@ -521,15 +521,9 @@ def find_candidates(
 
 def find_usual_brightness(amplitude: Image, significance: Image, limit: float) -> float:
     """Return the usual amplitude of the points of which a surface certainly consists; infinite if
-    none is that many standard deviations out of the noise.
-    """
-    sure = amplitude[significance > _find_sure_level(significance, limit)]
-    return float(np.median(sure)) if sure.size else np.inf
-
-
-def _find_sure_level(significance: Image, limit: float) -> float:
-    """Standard deviations from which on a point is certain. In little light none is 20 out of the
-    noise, but some are further than others.
+    none is that many standard deviations out of the noise. In little light none is 20 out of it, but
+    some are further than others.
     """
     upper = float(np.quantile(significance, UPPER_QUANTILE)) if significance.size else np.inf
-    return min(SURE_SIGMAS, max(limit, upper / 2))
+    sure = amplitude[significance > min(SURE_SIGMAS, max(limit, upper / 2))]
+    return float(np.median(sure)) if sure.size else np.inf

@@ -57,9 +57,7 @@ SLIT_PIXELS = 4
 PART_ROWS, MAX_PARTS = 1.5, 6
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
-SWEEP_LEFT_FRACTION = (
-    0.15  # of the corrections to a sweep, which are lines: what is left of its shape
-)
+SWEEP_LEFT_FRACTION = 0.15  # of the corrections to a sweep, lines: what is left of its shape
 PACE_PLACES = 16  # one of so many says how long rows take, on average
 PARALLEL_POINTS = 20_000  # threads take as long to begin as so many need
 MIN_BEHIND_PX = 100  # of a surface, seen through another; fewer are a rim, of which each has a part
@@ -77,9 +75,7 @@ class SurfaceState:
     delays: FloatArray
     stretches: FloatArray  # (views,), rows by which those delays grow over the streak image
     widths: FloatArray  # (views,), pulse widths, relative to the camera's
-    centres: (
-        FloatArray  # (views,), px by which the views lie farther along the slit than the camera's
-    )
+    centres: FloatArray  # (views,), px by which views lie farther along the slit than the camera's
     # (surfaces, views), logarithms of how bright each view sees what lies behind another surface,
     # relative to the mean over the views. Through gauze the view beside the lamp sees just what the
     # lamp lights, and the others see a part of it
@@ -101,15 +97,22 @@ class SurfaceState:
         return copy.deepcopy(self)
 
 
-def weigh_measurements(streak: Streak, camera: Camera) -> tuple[Image, Image]:
-    """Return the image above the dark level, and one over its variance; 0 where it is not valid."""
-    image = (streak.counts - np.float32(estimate_dark_level(streak.counts))).astype(np.float32)
-    # what fluctuates in the dark, in the unit of the light's own variance: a camera may add any constant
+def estimate_dark_variance(streak: Streak) -> float:
+    """Return what fluctuates in the dark, in the unit of the light's own variance: a camera may add any
+    constant.
+    """
     _, noise, gain = estimate_noise(streak.counts)
-    dark = DARK_VARIANCES * noise**2 / gain
+    return noise**2 / gain
+
+
+def weigh_measurements(streak: Streak, camera: Camera, dark: float) -> tuple[Image, Image]:
+    """Return the image above the dark level, and one over its variance; 0 where it is not valid. `dark`: of
+    `estimate_dark_variance`.
+    """
+    image = (streak.counts - np.float32(estimate_dark_level(streak.counts))).astype(np.float32)
     light = np.maximum(scipy.ndimage.gaussian_filter(image, 1.0), 0)
     # A measurement's variance is its photons; the floor stands for what the model cannot explain.
-    weights = 1 / (light + MODEL_ERROR_FRACTION * light.max() + dark)
+    weights = 1 / (light + MODEL_ERROR_FRACTION * light.max() + DARK_VARIANCES * dark)
     if streak.saturated is not None:
         weights[streak.saturated] = 0
     weights[:, camera.dead_columns] = 0
@@ -213,7 +216,8 @@ class Footprint(NamedTuple):
     rows_per_instant: float  # raw rows in the time of one, on average
 
 
-class Window(NamedTuple):
+@dataclass(frozen=True)
+class Window:
     """A part of streak images."""
 
     row: int  # of its corner
@@ -250,7 +254,8 @@ class SurfaceModel:
         self.reference = int(np.argmin(np.abs(camera.view_positions)))
         self.row_m = self.bin_width * SPEED_OF_LIGHT / 2
         self.pulse = pulse or ShotPulse(camera.pulse_fwhm / FWHM_PER_SIGMA / self.bin_width)
-        self.image, self.weights = weigh_measurements(streak, camera)
+        self.dark = estimate_dark_variance(streak)
+        self.image, self.weights = weigh_measurements(streak, camera, self.dark)
         self._cover(masks, bases)
         self.place(state)
 
@@ -261,7 +266,8 @@ class SurfaceModel:
         self.pixel = self.row * masks.shape[2] + self.column
         ends = np.searchsorted(self.surface, np.arange(len(masks) + 1))
         self.parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
-        self.functions = self._evaluate(self.pixel)
+        places = (self.pixel[part] for part in self.parts)
+        self.functions = [basis.evaluate(p) for basis, p in zip(bases, places, strict=True)]
         self._directions = compute_ray_directions(self.camera, self.row, self.column)
         axis_row, axis_column = self.camera.optical_axis_px
         self._x, self._y = self.column - axis_column, self.row - axis_row
@@ -310,11 +316,6 @@ class SurfaceModel:
         state = replace(self.state.copy(), coefficients=shapes, shading=shading)
         masks = np.concatenate([self.masks, masks])
         return self.lay_out(masks, [*self.bases, *known], state, self._draw_behind(len(masks)))
-
-    def _evaluate(self, pixel: NDArray[np.intp]) -> list[FloatArray]:
-        """The functions of each surface's basis, at one pixel for each point."""
-        bases = zip(self.bases, self.parts, strict=True)
-        return [basis.evaluate(pixel[part]) for basis, part in bases]
 
     def place(self, state: SurfaceState) -> None:
         """Move the surfaces to where `state` has them."""
@@ -485,9 +486,9 @@ class SurfaceModel:
         self._find_shades()
 
     def see(self, streak: Streak) -> SurfaceModel:
-        """Return the same surfaces before another shot of the camera."""
+        """Return the same surfaces before another shot of the camera, as noisy in the dark."""
         other = copy.copy(self)
-        other.image, other.weights = weigh_measurements(streak, self.camera)
+        other.image, other.weights = weigh_measurements(streak, self.camera, self.dark)
         return other
 
     def unexplained(self, amplitude: Image) -> float:
@@ -528,8 +529,7 @@ class SurfaceModel:
         """
         # a height is even between -1/2 and 1/2
         corrected = np.mean(self.state.delays**2 + self.state.stretches**2 / 12)
-        rows = SWEEP_LEFT_FRACTION * float(np.sqrt(corrected))
-        return rows * self.row_m
+        return SWEEP_LEFT_FRACTION * float(np.sqrt(corrected)) * self.row_m
 
     def compute_slopes(self) -> FloatArray:
         """Return how steeply the ranges change along columns and rows, (2, points), m per pixel."""

@@ -100,22 +100,6 @@ class Patch:
         return _fit_quadratic(*some, self.ray_length, penalty)
 
 
-def find_patches(
-    pixels: Pixels,
-    distance: FloatArray,
-    deviation: FloatArray,
-    ray_length: FloatArray,
-    bin_m: float,
-) -> list[Patch]:
-    """Find the smooth surfaces in a picture's returns, (n,) each, the largest first. A pixel may
-    have several returns.
-    """
-    found = find_plain_patches(pixels, distance, deviation, ray_length, bin_m)
-    bent = (_bend_where_needed(patch, bin_m) for patch in found)
-    parts = [part for patch in bent for part in _part_at_creases(patch, bin_m)]
-    return sorted(parts, key=lambda part: -part.pixels.size)
-
-
 def find_plain_patches(
     pixels: Pixels,
     distance: FloatArray,
@@ -123,7 +107,9 @@ def find_plain_patches(
     ray_length: FloatArray,
     bin_m: float,
 ) -> list[Patch]:
-    """The same, all of them quadratics: which returns belong together."""
+    """Find the smooth surfaces in a picture's returns, (n,) each, the largest first, all of them quadratics:
+    which returns belong together. A pixel may have several.
+    """
     if pixels.size == 0:
         return []
     patches = _split(_fit_quadratic(pixels, distance, deviation, ray_length), bin_m)
@@ -139,6 +125,13 @@ def find_plain_patches(
                     del patches[second]
             first += 1
     return sorted(patches, key=lambda patch: -patch.pixels.size)
+
+
+def bend_patches(patches: list[Patch], bin_m: float) -> list[Patch]:
+    """Bend plain patches where their returns are, and part them at creases; the largest first."""
+    bent = (_bend_where_needed(patch, bin_m) for patch in patches)
+    parts = [part for patch in bent for part in _part_at_creases(patch, bin_m)]
+    return sorted(parts, key=lambda part: -part.pixels.size)
 
 
 def _split(patch: Patch, bin_m: float) -> list[Patch]:

@@ -45,9 +45,6 @@ class ShotPulse:
     lags: NDArray[np.intp] = field(default_factory=lambda: np.zeros(1, np.intp))
     # (n,), its light there; the sum is 1
     shares: FloatArray = field(default_factory=lambda: np.ones(1))
-    # full width at half maximum, as the shot shows it, over the camera's; 1 where nothing was
-    # measured
-    width_ratio: float = 1.0
     # of its light, what comes more than one and a half of the camera's widths after the peak
     tail_share: float = 0.0
 
@@ -95,7 +92,7 @@ def measure_pulse(frames: Frames, pixels: NDArray[np.intp], distance: FloatArray
     # where the pulse is at its peak is its return, as for a search of returns
     sigma = float(np.sqrt(max(cores[best] ** 2 - ROW_VARIANCE, ROW_VARIANCE)))
     own = allowed[kept].astype(np.intp)
-    return ShotPulse(sigma, own, shares[kept] / shares[kept].sum(), ratio, tail)
+    return ShotPulse(sigma, own, shares[kept] / shares[kept].sum(), tail)
 
 
 def find_usual_course(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -68,21 +68,13 @@ Unknown = tuple[str, int, int]
 RIDGE = 1e-6  # of each unknown's own information: for what the shot says nothing about
 
 
-class Derivatives(NamedTuple):
+@dataclass(frozen=True)
+class Derivatives(Window):
     """Derivatives of the streak image by some unknowns on a part of it: whole clusters, which no
     other part with the same unknowns shares.
     """
 
-    names: list[Unknown]
-    row: int  # of the part's corner
-    column: int  # of the part's corner
-    images: Image  # (unknowns, rows, columns)
-
-    @property
-    def area(self) -> tuple[slice, slice]:
-        """Where the part lies."""
-        _, rows, columns = self.images.shape
-        return slice(self.row, self.row + rows), slice(self.column, self.column + columns)
+    names: list[Unknown]  # one for each image
 
 
 def iterate_derivatives(
@@ -138,14 +130,14 @@ def _join_windows(
             boxes, apart = apart, []
         boxes = [*apart, (top, bottom, left, right, held)]
     if not boxes:  # nothing of it falls on the slit
-        yield Derivatives(names, 0, 0, np.zeros((len(names), 0, 0), np.float32))
+        yield Derivatives(0, 0, np.zeros((len(names), 0, 0), np.float32), names)
     for top, bottom, left, right, held in boxes:
         images = np.zeros((len(names), bottom - top, right - left), np.float32)
         for window in held:
             _, height, width = window.images.shape
             row, column = window.row - top, window.column - left
             images[:, row : row + height, column : column + width] += window.images
-        yield Derivatives(names, top, left, images)
+        yield Derivatives(top, left, images, names)
 
 
 def _differentiate_view(model: SurfaceModel, amplitude: Image, view: int) -> list[Derivatives]:
@@ -155,7 +147,7 @@ def _differentiate_view(model: SurfaceModel, amplitude: Image, view: int) -> lis
     beside = -np.gradient(seen.images, axis=2) if seen.images.size else seen.images
     images = np.concatenate([seen.images, widened.images, beside])
     names: list[Unknown] = [(name, 0, view) for name in ("gains", "widths", "centres")]
-    found = [*_join_windows(model, names, [seen._replace(images=images)])]
+    found = [*_join_windows(model, names, [replace(seen, images=images)])]
     for surface in np.unique(model.surface[model.behind]):
         part = model.parts[surface]
         hidden = model.receive(view, amplitude[part] * model.behind[part], kernel, part)
@@ -439,10 +431,7 @@ def doubt_borders(model: SurfaceModel, amplitude: Image) -> Image:
     late = PARTLY_FILLED_PX * np.hypot(*(np.array(uneven) * model.compute_slopes())) / model.row_m
     late *= np.array([not isinstance(basis, QuadricBasis) for basis in model.bases])[model.surface]
     moved = delay_light(model).render((amplitude * late).astype(np.float32))
-    seen = model.weights > 0
-    return np.where(seen, 1 / (1 / np.where(seen, model.weights, 1) + moved**2), 0).astype(
-        np.float32
-    )
+    return model.weights / (1 + model.weights * moved**2)
 
 
 def delay_light(model: SurfaceModel) -> SurfaceModel:
@@ -580,7 +569,7 @@ def _eliminate_amplitude(
         surface = group.names[0][1]
         _, quadratic = shares[surface]
         group.images[...] -= _combine(quadratic, seen.images)
-        patterns.append(seen._replace(names=[("patterns", *name[1:]) for name in seen.names]))
+        patterns.append(replace(seen, names=[("patterns", *name[1:]) for name in seen.names]))
     return changes, patterns
 
 

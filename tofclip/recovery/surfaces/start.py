@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.camera import Camera, measure
+from tofclip.camera import Camera, estimate_dark_level, measure
 from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar import compute_ray_directions
@@ -19,14 +19,13 @@ from tofclip.recovery.surfaces.model import (
     SurfaceModel,
     SurfaceState,
     compare_smoothed,
-    weigh_measurements,
 )
 from tofclip.recovery.surfaces.patches import (
     MARGIN_PX,
     Patch,
+    bend_patches,
     extend_patches,
     find_dimmer_patches,
-    find_patches,
     find_plain_patches,
     reach_further,
 )
@@ -156,8 +155,8 @@ def find_brightest_patches(returns: Returns, ray_length: FloatArray, bin_m: floa
     """Patches of each pixel's strongest return: weaker ones are often the frames' own, and would widen
     the surfaces.
     """
-    found = find_patches(*_list_strongest(returns), ray_length, bin_m)
-    return extend_patches(found, returns, bin_m)
+    plain = find_plain_patches(*_list_strongest(returns), ray_length, bin_m)
+    return extend_patches(bend_patches(plain, bin_m), returns, bin_m)
 
 
 def _list_strongest(returns: Returns) -> tuple[Pixels, FloatArray, FloatArray]:
@@ -203,7 +202,7 @@ def estimate_darkness(streak: Streak, frames: Frames) -> float:
     noise = MeasurementNoise.from_figures(frames.figures)
     if noise is None:
         return 0.0
-    image, _ = weigh_measurements(streak, frames.camera)
+    image = streak.counts - np.float32(estimate_dark_level(streak.counts))
     variance = float(np.sum(noise.compute_variance(np.maximum(image, 0))))
     signal = np.linalg.norm(scipy.ndimage.gaussian_filter(image, SMOOTHING_PX))
     # what is left of the variance of neighbours' mean
