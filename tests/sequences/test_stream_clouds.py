@@ -123,6 +123,26 @@ def test_surfaces_follow_those_of_the_last_shot_until_the_scene_changes(streaks,
     assert np.median(clouds[3].range) == pytest.approx(1.3, abs=5e-3)
 
 
+def test_a_stream_of_rows_far_shorter_than_the_pulse_shows_what_its_shots_show(camera):
+    """A frame of a tenth of a pulse's time holds hardly any light: rows are added up."""
+    scene = Scene((make_plate((0.0, 0.0, 1.3), (0.18, 0.18), make_plain_pattern(0.8)),))
+    made = Instrument(camera, StreakDetector(420, 15e-12, peak_photons=2e3))
+    first, second = (simulate_shot(scene, made, seed).streak for seed in range(2))
+    alone = recover(first, method="surfaces").returns
+    pipeline = SurfacePipeline.for_shot(first)
+    found = follow(pipeline, first)
+    # the same surfaces, of which a stream leaves out what is more likely false than there
+    assert len(alone) >= len(found) > 0.9 * len(alone) > 100
+    own = {(y, x): r for y, x, r in zip(alone.y, alone.x, alone.range, strict=True)}
+    assert all(own[y, x] == r for y, x, r in zip(found.y, found.x, found.range, strict=True))
+    # a camera's sweep is told in the rows of the shots
+    assert found.camera.sweep == alone.camera.sweep == camera.sweep
+    later = follow(pipeline, second)
+    assert pipeline.searches == 1
+    assert len(later) == pytest.approx(len(found), rel=0.05)
+    assert np.median(later.range) == pytest.approx(np.median(found.range), abs=7e-4)
+
+
 @pytest.mark.parametrize("prepared", [False, True])
 def test_leaving_clouds_early_closes_their_source(prepared):
     made, closed = shots(1), Event()

@@ -34,6 +34,7 @@ from tofclip.recovery import (
 )
 from tofclip.recovery.defects import estimate_noise
 from tofclip.recovery.focus import DEFAULT_FOCUS
+from tofclip.recovery.shot import count_needless_rows
 from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces
 from tofclip.recovery.surfaces.returns import list_returns
 from tofclip.sequences.cache import CachedInverse, get_cached_camera
@@ -113,7 +114,9 @@ class SurfacePipeline:
 
     def __init__(self, shot: Shot, method: SurfaceRecovery | None = None) -> None:
         self.method = SurfaceRecovery() if method is None else method
-        self.camera, self._centre_error_px = shot.camera, shot.centre_error_px
+        self.camera = shot.camera
+        # rows of a stream are added up like the first shot's: surfaces are followed from shot to shot
+        self._rows_in_one, self._opened = count_needless_rows(shot), shot
         self.searches = 0  # for surfaces, in a shot that those of the one before do not explain
         self._fit: SurfaceFit | None = None
         self._lock = Lock()
@@ -136,23 +139,25 @@ class SurfacePipeline:
 
     def recover_shot(self, shot: Streak, rectified: None) -> SurfaceFit:
         """Fit the surfaces of a shot."""
+        opened = replace(self._opened, streak=shot).merge_rows(self._rows_in_one)
+        shot = opened.streak
         with self._lock:
             if self._fit is not None:
-                look = partial(self._look, shot)
+                look = partial(self._look, opened)
                 self._fit = follow_surfaces(self._fit, shot, self.method.weight, look)
             if self._fit is None:
                 self.searches += 1
-                opened = Shot(shot, self.camera, self._centre_error_px)
                 start = plan_recovery(opened, self.method.start, self._focus).run()
                 weight, iterations = self.method.weight, self.method.iterations
                 self._fit = fit_surfaces(shot, start, weight, iterations)
             return self._fit
 
-    def _look(self, shot: Streak) -> tuple[Returns, Float32Array]:
+    def _look(self, opened: Shot) -> tuple[Returns, Float32Array]:
         """Return what l1 shows of a shot: its returns, and the light of each pixel."""
         self.searches += 1
+        shot = opened.streak
         if self._quick is None:
-            camera = self.camera.replace(range_calibration=None)
+            camera = opened.camera.replace(range_calibration=None)
             self._quick = RangingPipeline(camera, shot.times, Sparse(), self._focus)
         seen = self._quick.recover_shot(shot, self._quick.rectify(shot))
         assert isinstance(seen, PictureTraces)
@@ -160,7 +165,10 @@ class SurfacePipeline:
 
     def search(self, found: SurfaceFit) -> Returns:
         """List the returns of what `recover_shot` returned."""
-        return keep_probable(list_returns(found, self.method.detection, self._centre_error_px))
+        error_px = self._opened.centre_error_px
+        returns = keep_probable(list_returns(found, self.method.detection, error_px))
+        # a sweep is that of the shot's own rows
+        return replace(returns, camera=returns.camera.replace(sweep=self.camera.sweep))
 
 
 class StillAverage:
