@@ -45,6 +45,9 @@ MERGE_EXCESS = 1.3  # or of their misfit to a surface of their own
 MERGE_REACH_BINS, MERGE_REACH_MISFITS = 7.0, 5.0
 # Of returns, also in their deviations: further off a patch's surface they may be another's.
 SPLIT_BINS, SPLIT_SIGMAS = 4.0, 3.0
+# Off the returns, median, lies what was fitted to two surfaces, between them (others up to 2.2); places
+# where a plane is tried then, and how far from one returns show it
+BETWEEN_BINS, PLANE_TRIALS, PLANE_PX = 3.0, 40, 7
 MERGE_SIGMAS = 1.0  # median; 0.67 are expected of returns of the surface
 FIT_ITERATIONS, SETTLED_SCALE = 10, 0.003  # at most, until the errors' scale changes by less
 FITTED_RETURNS = 2000  # of a patch, evenly chosen: with more a start is no better
@@ -143,12 +146,13 @@ def _split(patch: Patch, bin_m: float) -> list[Patch]:
     for own in _connect_neighbours(patch.pixels, patch.distance, patch.ray_length.shape, tolerance):
         part, apart = patch.take(own), []
         flat = part.take(slice(None), FLAT_PENALTY)
-        off = np.abs(flat.compute_ranges(part.pixels) - part.distance)
-        far = off > np.maximum(SPLIT_BINS * bin_m, SPLIT_SIGMAS * part.deviation)
+        far = _measure_distance(part, flat, bin_m) > 1
         if far.sum() >= MIN_DIMMER_PX and not far.all():
-            large = [p for p in _split(part.take(far), bin_m) if p.pixels.size >= MIN_DIMMER_PX]
             # what splines follow is the rim of a round surface
-            whole = _bend_where_needed(part, bin_m) if large else part
+            whole = _bend_where_needed(part, bin_m)
+            if whole.compute_error() > BETWEEN_BINS * bin_m:
+                far = _measure_distance(part, _find_plane(part, flat, bin_m), bin_m) > 1
+            large = [p for p in _split(part.take(far), bin_m) if p.pixels.size >= MIN_DIMMER_PX]
             apart = [one for one in large if _stands_apart(one, whole, bin_m)]
         if apart:
             left = ~np.isin(part.pixels, np.concatenate([one.pixels for one in apart]))
@@ -156,6 +160,28 @@ def _split(patch: Patch, bin_m: float) -> list[Patch]:
         else:
             found.append(part)
     return found
+
+
+def _find_plane(patch: Patch, flat: Patch, bin_m: float) -> Patch:
+    """The plane to which a patch's returns are nearest, of that of all, `flat`, and of those that returns
+    about single places show: what is fitted to a table and a melon follows neither (MSAC, P. Torr and A.
+    Zisserman, Comput. Vis. Image Underst. 78, 138, 2000).
+    """
+    y, x = np.divmod(patch.pixels, patch.ray_length.shape[1])
+    planes = [flat]
+    for middle in np.linspace(0, y.size - 1, PLANE_TRIALS).astype(np.intp):
+        about = np.maximum(np.abs(y - y[middle]), np.abs(x - x[middle])) <= PLANE_PX
+        if about.sum() >= MIN_PATCH_PX:
+            on = _measure_distance(patch, patch.take(about, FLAT_PENALTY), bin_m) <= 1
+            planes.append(patch.take(on, FLAT_PENALTY))
+    off = [np.minimum(_measure_distance(patch, plane, bin_m), 1).sum() for plane in planes]
+    return planes[int(np.argmin(off))]
+
+
+def _measure_distance(patch: Patch, plane: Patch, bin_m: float) -> FloatArray:
+    """How far returns are from a plane, (n,), of what a return on it may be."""
+    most = np.maximum(SPLIT_BINS * bin_m, SPLIT_SIGMAS * patch.deviation)
+    return np.asarray(np.abs(plane.compute_ranges(patch.pixels) - patch.distance) / most)
 
 
 def _stands_apart(part: Patch, whole: Patch, bin_m: float) -> bool:
