@@ -367,6 +367,23 @@ def test_a_refused_or_taken_step_never_raises_the_misfit(shot):
     assert model.state.delays[3] == model.state.stretches[3] == 0
 
 
+def test_light_lies_where_a_surface_fills_its_pixels(shot):
+    """A fifth of the pixels before the end is filled, of light that fades evenly all of them."""
+    model = make_model(shot.streak)
+    own, (y, x) = model.surface == 0, np.divmod(model.pixel, SHAPE[1])
+    first, last = x[own].min(), x[own].max()
+    amplitude = np.where(x < last - 3, 50, np.where(x == last - 3, 10, 0)).astype(np.float32)
+    model.fill_partly(amplitude)
+    line = own & (y == int(np.median(y[own])))
+    right, down = model.aside[:, line]
+    expected = np.where(np.arange(first, last + 1) == last - 3, -(1 - 0.2) / 2, 0)
+    np.testing.assert_allclose(right, expected, atol=1e-6)
+    np.testing.assert_allclose(down, 0, atol=1e-6)
+    model.fill_partly((10 * (last + 1 - x)).clip(0).astype(np.float32))
+    right, _ = model.aside[:, line]
+    np.testing.assert_allclose(right[2:], 0, atol=1e-6)  # what lies before the first is not known
+
+
 def test_views_that_are_all_late_do_not_pass_for_nearer_surfaces(shot):
     """Amplitudes explain much of both. Where that is left out for the views, the second step leaves
     36 and 20 um of it; the state is the true one but for them, and there is no noise.
@@ -374,6 +391,7 @@ def test_views_that_are_all_late_do_not_pass_for_nearer_surfaces(shot):
     model = make_model(shot.streak)
     y, x = np.divmod(model.pixel, SHAPE[1])
     amplitude = np.where((x // 6 + y // 6) % 2 == 0, 60, 30).astype(np.float32)
+    model.fill_partly(amplitude)
     model.image = model.render(amplitude)
     model.weights = 1 / (model.image + 5)
     true = model.distance

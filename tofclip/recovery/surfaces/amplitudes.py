@@ -98,10 +98,11 @@ class AmplitudeSolver:
 
     def measure_light(self) -> FloatArray:
         """By how many deviations of a pixel's noise the light of each surface stands out of it, on average
-        over the light, (surfaces,).
+        over the light, (surfaces,). Of the noise that the weights expect: what else the model does not
+        explain no prior makes better.
         """
         model, amplitude = self.model, self.amplitude
-        information = np.maximum(model.gather(model.weights, squared=True) / self.variance, 0)
+        information = np.maximum(model.gather(model.weights, squared=True), 0)
         light, out = (
             np.bincount(model.surface, one, len(model.parts))
             for one in (amplitude, amplitude**2 * np.sqrt(information))

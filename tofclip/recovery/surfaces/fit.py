@@ -21,25 +21,33 @@ from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, Tick, share_misfit
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.patches import find_dimmer_patches, rank_within_pixels
-from tofclip.recovery.surfaces.pulse import Image
+from tofclip.recovery.surfaces.pulse import (
+    FWHM_PER_SIGMA,
+    LEAST_EXPLAINED,
+    LEAST_TAIL,
+    Image,
+    measure_pulse,
+)
 from tofclip.recovery.surfaces.ranges import Refinement, refine_state
 from tofclip.recovery.surfaces.shapes import COEFFICIENTS, ROUND_COEFFICIENTS, Pixels
 from tofclip.recovery.surfaces.start import (
     CHANGED_RATIO,
     MAX_UNEXPLAINED,
     SURE_FALSE_ALARM,
+    call_dark,
     estimate_darkness,
     find_brightest_patches,
     find_surfaces,
     lay_out,
     measure_rays,
     require_explained,
+    require_pulse,
 )
 from tofclip.shots import Frames, Returns, Streak
 from tofclip.solvers import Progress, ignore_progress
 from tofclip.threads import limit_blas_threads
 
-START_ITERATIONS = 25
+START_ITERATIONS, PULSE_ITERATIONS = 25, 10  # of these, before the pulse is measured
 MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 6, 10
 AGAINST_DIM = 3.0  # until ranges are known; then amplitudes are as the shot has them
 # What dim light costs, in deviations, and for how many iterations at most, where it is to stay only as
@@ -117,10 +125,7 @@ def fit_surfaces(
         dark = estimate_darkness(streak, frames)
         if dark <= MAX_UNEXPLAINED:
             raise
-        raise InputError(
-            f"noise is {100 * dark:.0f} % of this shot's signal: it is too dark for surfaces; "
-            'choose `method="tv"`, or average shots'
-        ) from fault
+        raise call_dark(dark) from fault
 
 
 def _fit_returns(
@@ -134,8 +139,10 @@ def _fit_returns(
     """Fit the surfaces that returns show."""
     solver = find_surfaces(found, streak, frames, weight)
 
-    # 4. Amplitudes.
-    solver.run(START_ITERATIONS, tick, AGAINST_DIM)
+    # 4. Amplitudes, and the pulse as they show it.
+    solver.run(PULSE_ITERATIONS, tick, AGAINST_DIM)
+    solver = _measure_pulse(solver)
+    solver.run(START_ITERATIONS - PULSE_ITERATIONS, tick, AGAINST_DIM)
     limit = np.hypot(MAX_UNEXPLAINED, estimate_darkness(streak, frames))
     if solver.model.unexplained(solver.amplitude) > limit:
         # what is too small for a surface may be all that is bright
@@ -155,6 +162,16 @@ def _fit_returns(
     reference = solver.model.unexplained(solver.amplitude)
     beside = _find_others(solver, found, tick)
     return SurfaceFit(solver, sparse, refinement, remainder, reference, *beside, found)
+
+
+def _measure_pulse(solver: AmplitudeSolver) -> AmplitudeSolver:
+    """Give surfaces the pulse that the shot shows."""
+    model, light = solver.model, solver.model.render_instants(solver.amplitude)
+    width = FWHM_PER_SIGMA * model.pulse.sigma
+    least_tail = max(LEAST_TAIL, LEAST_EXPLAINED * model.unexplained(solver.amplitude))
+    pulse = measure_pulse(light, model.image, model.weights, width, least_tail)
+    require_pulse(pulse)
+    return AmplitudeSolver(model.respond(pulse), solver.amplitude, solver.weight, solver)
 
 
 @limit_blas_threads()

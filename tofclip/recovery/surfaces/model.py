@@ -55,6 +55,8 @@ SLIT_PIXELS = 4
 # Rows that a part of a pixel spans where a surface is turned far, and parts along a side at most:
 # a pulse of a row or more does not tell so narrow a ramp from an instant
 PART_ROWS, MAX_PARTS = 1.5, 6
+LEAST_FILLED = 0.1  # of a pixel's side, by a surface that ends in it
+TINY = float(np.finfo(np.float32).tiny)
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
 SWEEP_LEFT_FRACTION = 0.15  # of the corrections to a sweep, lines: what is left of its shape
@@ -180,17 +182,26 @@ class Places(NamedTuple):
 
     @classmethod
     def split(
-        cls, distance: FloatArray, slopes: FloatArray, pulse_rows: float, row_m: float
+        cls,
+        distance: FloatArray,
+        slopes: FloatArray,
+        aside: FloatArray,
+        pulse_rows: float,
+        row_m: float,
     ) -> Places:
-        """Split points by the slopes of their surfaces, (2, points), m per pixel."""
+        """Split points by the slopes of their surfaces, m per pixel; `aside`: where the middle of their
+        light is, px from the pixel's; both (2, points).
+        """
+        filled = 1 - 2 * np.abs(aside)
+        slopes = slopes * filled
         counts = np.clip(np.ceil(np.abs(slopes) / row_m / PART_ROWS), 1, MAX_PARTS).astype(np.intp)
         total = counts[0] * counts[1]
         point = np.repeat(np.arange(distance.size), total)
         starts = np.concatenate([[0], np.cumsum(total)])
         right, down = np.divmod(np.arange(point.size) - starts[point], counts[1, point])
-        size = 1 / counts[:, point]
-        offset = (np.stack([right, down]) + 0.5) * size - 0.5
-        away = np.sum(offset * slopes[:, point], axis=0)
+        size = (filled / counts)[:, point]
+        offset = (np.stack([right, down]) + 0.5) * size - 0.5 * filled[:, point] + aside[:, point]
+        away = np.sum(offset * (slopes / filled)[:, point], axis=0)
         ramp = np.hypot(*slopes) / row_m / pulse_rows  # pulses that a pixel spans
         overlap = (1 / np.sqrt(1 + ramp**2 / 6)).astype(np.float32)
         share = (1 / total).astype(np.float32)
@@ -275,36 +286,40 @@ class SurfaceModel:
         self.beside = self._find_neighbours()
         self.outer = np.flatnonzero(np.isin(self.column, [0, masks.shape[2] - 1]))
         self.behind = np.zeros(self.surface.size, bool)
+        self.aside = np.zeros((2, self.surface.size))
 
     def lay_out(
         self,
         masks: NDArray[np.bool_],
         bases: Sequence[SmoothBasis],
         state: SurfaceState,
-        behind: NDArray[np.bool_] | None = None,
+        seen: FloatArray | None = None,
     ) -> SurfaceModel:
-        """Return a model of other surfaces before the same shot; `behind` (surfaces, rows, columns): which
-        points are seen through another surface.
+        """Return a model of other surfaces before the same shot; `seen` (3, surfaces, rows, columns): of
+        `_draw_points`, as far as it is known.
         """
         other = copy.copy(self)
         other._cover(masks, bases)
-        if behind is not None:
-            other.behind = behind[masks]
+        if seen is not None:
+            behind, *aside = seen[:, masks]
+            other.behind, other.aside = behind > 0, np.array(aside)
         other.place(state)
         return other
 
-    def _draw_behind(self, surfaces: int) -> NDArray[np.bool_]:
-        """Where points lie behind another surface, (surfaces, rows, columns)."""
-        behind = np.zeros((surfaces, *self.masks.shape[1:]), bool)
-        behind[self.surface, self.row, self.column] = self.behind
-        return behind
+    def _draw_points(self, surfaces: int) -> FloatArray:
+        """Which points lie behind another surface, and where in its pixel the middle of each one's light is,
+        px to the right and down, (3, surfaces, rows, columns).
+        """
+        seen = np.zeros((3, surfaces, *self.masks.shape[1:]))
+        seen[:, self.surface, self.row, self.column] = self.behind, *self.aside
+        return seen
 
     def cover(self, masks: NDArray[np.bool_]) -> SurfaceModel:
         """Return the same surfaces, each where its mask is; those without any are left out."""
         left, state = np.flatnonzero(masks.any(axis=(1, 2))), self.state.copy()
         bases, shapes = [self.bases[k] for k in left], [state.coefficients[k] for k in left]
         state = replace(state, coefficients=shapes, shading=state.shading[left])
-        return self.lay_out(masks[left], bases, state, self._draw_behind(len(masks))[left])
+        return self.lay_out(masks[left], bases, state, self._draw_points(len(masks))[:, left])
 
     def add(self, masks: NDArray[np.bool_], inverse: FloatArray) -> SurfaceModel:
         """Return the same surfaces, and behind them others whose inverse depths are known, 1/m; both
@@ -315,7 +330,7 @@ class SurfaceModel:
         shading = np.pad(self.state.shading, ((0, len(known)), (0, 0)))
         state = replace(self.state.copy(), coefficients=shapes, shading=shading)
         masks = np.concatenate([self.masks, masks])
-        return self.lay_out(masks, [*self.bases, *known], state, self._draw_behind(len(masks)))
+        return self.lay_out(masks, [*self.bases, *known], state, self._draw_points(len(masks)))
 
     def place(self, state: SurfaceState) -> None:
         """Move the surfaces to where `state` has them."""
@@ -326,7 +341,7 @@ class SurfaceModel:
         self.derivatives = [basis.differentiate(f, c) for basis, f, c in shapes]
         self.distance = np.asarray(self.ray_length / np.maximum(inverse, MIN_INVERSE_DEPTH))
         self.places = Places.split(
-            self.distance, self.compute_slopes(), self.pulse.sigma, self.row_m
+            self.distance, self.compute_slopes(), self.aside, self.pulse.sigma, self.row_m
         )
         # (views, outer points), the fraction by which each view sees more or less of a point in the
         # picture's outer columns than the reference view, if its picture ends where its own does
@@ -353,6 +368,25 @@ class SurfaceModel:
         last = min(last - self.before + int(self.pulse.lags.max()), self.image.shape[0])
         self._lit = slice(min(max(first, 0), max(last, 0)), max(last, 0))
         self._find_shades()
+
+    def fill_partly(self, amplitude: Image) -> None:
+        """Put the light of pixels that a surface fills in part on the side of the brighter of the pixels
+        beside them: as much as is missing from what these, going on as they do, would make it.
+        """
+        own = np.arange(amplitude.size)
+        beyond = np.take_along_axis(self.beside, self.beside, axis=-1)
+        before, behind = np.where(self.beside == own, 0, amplitude[self.beside]).swapaxes(0, 1)
+        ahead, after = amplitude[beyond].swapaxes(0, 1)
+        dark, bright = np.minimum(before, behind), np.maximum(before, behind)
+        further = np.where(behind > before, after, ahead)
+        whole = np.clip(2 * bright - further, dark, bright)
+        light = np.clip(amplitude, dark, whole)
+        part = (light - dark) / np.maximum(whole - dark, TINY)
+        away = (
+            (1 - np.maximum(part, LEAST_FILLED)) / 2 * (light - dark) / np.maximum(amplitude, TINY)
+        )
+        self.aside = np.where(behind > before, away, -away).astype(np.float64)
+        self.place(self.state)
 
     def _find_neighbours(self) -> NDArray[np.intp]:
         """Numbers of the points of the same surface beside each, (2, 2, points): along columns and
@@ -409,9 +443,12 @@ class SurfaceModel:
         np.clip(first, seen.min(initial=last), seen.max(initial=-margin), out=first)
         slit_first = np.empty(row.size, np.int32)
         slit = np.empty((row.size, SLIT_PIXELS), np.float32)
+        outward, further = self._reach_out(view)
+        column += outward
         along = np.clip(column, -SLIT_PIXELS, columns + SLIT_PIXELS)
         tangent = float(np.tan(self.camera.angles[view]))
-        kernels.split_over_slit(along, *self.places.size, tangent, slit_first, slit)
+        across, down = self.places.size
+        kernels.split_over_slit(along, across * (1 + further), down, tangent, slit_first, slit)
         slit[along != column] = 0
         left = int(slit_first.min(initial=columns))
         wide = max(int(slit_first.max(initial=-SLIT_PIXELS)) + SLIT_PIXELS - left, 0)
@@ -426,6 +463,16 @@ class SurfaceModel:
         light = first, shares, slit_first, slit, (high, wide), top, left
         reached_rows = np.flatnonzero(reached) - margin - top
         return Footprint(*light, lines - top, reached_rows, between, height, pace)
+
+    def _reach_out(self, view: int) -> tuple[FloatArray, FloatArray]:
+        """Where a view's picture ends beyond the outer columns: by how much parts of points lie further to
+        the right, px, and are wider, relative, (places,) each.
+        """
+        further, side = np.zeros((2, self.surface.size))
+        further[self.outer] = self.state.borders * self.excess[view]
+        side[self.outer] = np.where(self.column[self.outer] == 0, -1, 1)
+        further, side = further[self.places.point], side[self.places.point]
+        return side * further * (0.5 + side * self.places.offset[0]), further
 
     def _locate(
         self, view: int, x: FloatArray, y: FloatArray, right: FloatArray, shear: FloatArray
@@ -489,6 +536,13 @@ class SurfaceModel:
         """Return the same surfaces before another shot of the camera, as noisy in the dark."""
         other = copy.copy(self)
         other.image, other.weights = weigh_measurements(streak, self.camera, self.dark)
+        return other
+
+    def respond(self, pulse: ShotPulse) -> SurfaceModel:
+        """Return the same surfaces as another pulse shows them."""
+        other = copy.copy(self)
+        other.pulse = pulse
+        other.place(self.state)
         return other
 
     def unexplained(self, amplitude: Image) -> float:
@@ -631,6 +685,14 @@ class SurfaceModel:
         """Return A a, (rows, columns)."""
         image = np.zeros_like(self.image)
         image[self._lit] = self._render_lit(amplitude)
+        return image
+
+    def render_instants(self, amplitude: Image) -> Image:
+        """Return the image, (rows, columns), of a pulse of an instant, without what follows it."""
+        image, instant = np.zeros_like(self.image), (self._lags == 0).astype(np.float32)
+        for view in range(self.camera.views):
+            window = self.receive(view, amplitude, instant)
+            image[window.area] += window.images[0]
         return image
 
     def _render_lit(self, amplitude: Image) -> Image:

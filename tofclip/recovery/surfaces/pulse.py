@@ -1,13 +1,13 @@
-"""The pulse that a shot itself shows: the usual course of light in the pixels of its surfaces.
+"""The pulse that a shot itself shows: the course of light that explains it best, from where surfaces are.
 
-A camera's file knows one width of its pulse; an instrument's pulse may be longer and have a tail,
-as of a phosphor's afterglow. On surfaces each pixel's light follows the pulse, so that the median
-over many pixels, each seen from its own return, is the pulse, whatever lies before or behind.
+A camera's file knows one width of its pulse; an instrument's pulse may be shorter, longer, and have a
+tail, as of a phosphor's afterglow. Frames show it blurred by what they mix, and wider where a pixel
+spans several rows of range; a model of surfaces knows where each light comes from.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
@@ -15,24 +15,26 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.lidar.pulse import Pulse
-from tofclip.shots import Frames
-from tofclip.units import SPEED_OF_LIGHT
 
 Image = NDArray[np.float32]
 
 FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
-REACH_BEFORE, REACH_AFTER = 4.0, 14.0  # of the camera's pulse widths: what is looked at
-BRIGHT_QUANTILE = 0.5  # of the pixels: the brighter half shows the pulse
-# Frames of a Gaussian pulse show up to 1.18 of its width, as rows integrate it, and no tail.
-SHORTER, GAUSSIAN_WIDTH, GAUSSIAN_TAIL = 0.5, 1.3, 0.05
+REACH_BEFORE, REACH_AFTER = 2.0, 14.0  # camera's pulse widths: what is looked at
+SHOWN = 30_000  # lit measurements, of evenly chosen columns, say as much of a few dozen lags as all
+COURSE_RIDGE = 1e-4  # of a lag's own information
+# Times the camera's width: what is nearer the fit finds itself
+NARROW, WIDE = 0.67, 1.5
 TAIL_START = 1.5  # camera's pulse widths after the return
-CORES = np.arange(0.7, 2.5, 0.1)  # widths that are tried, of the camera's
+# Of the pulse's light, and of what a pulse without it leaves unexplained: a tail that is less may be
+# light of surfaces that are off, or missing (0.4 in few photons; tails 0.5 to 1.1).
+LEAST_TAIL, LEAST_EXPLAINED = 0.05, 0.45
+CORES = np.arange(0.7, 1.5, 0.1)  # widths that are tried, of the one that the course shows
 CORE_EXCESS = 1.1  # of the least misfit: the widest core that is as good
-LAGS_BEFORE = 0.5  # camera's pulse widths: where the core may lie before the peak
-ROW_VARIANCE = 1 / 12  # rows^2, by which a row's own duration widens what frames show
+LAGS_BEFORE = 0.5  # pulse widths: where the core may lie before the peak
 LEAST_SHARE = 1e-3  # of the pulse's light: below, a lag is none of the tail's
 EXTENT_SIGMAS = 3.5  # 5e-4 of a pulse lie outside
 SPLINE_LEFT_VARIANCE = 1 / 6  # rows^2: a B-spline's 1/4 without the 1/12 of the row itself
+TINY = float(np.finfo(np.float32).tiny)
 MIN_VARIANCE = 0.02  # rows^2, of the smoothing that is left of a pulse shorter than a row
 
 
@@ -61,62 +63,52 @@ class ShotPulse:
         return np.asarray(np.convolve(core, tail).astype(np.float32))
 
 
-def measure_pulse(frames: Frames, pixels: NDArray[np.intp], distance: FloatArray) -> ShotPulse:
-    """Measure the pulse of a shot in its frames; the camera's where it is as short as that.
-    `pixels` (n,): raster numbers of pixels that lie on surfaces; `distance` (n,): range of the
-    strongest return of each, m.
+def measure_pulse(
+    light: Image, image: Image, weights: Image, width: float, least_tail: float
+) -> ShotPulse:
+    """Measure the pulse of a shot, (rows, columns); the camera's, `width` rows wide at half its height,
+    where it is nearly that and no more than `least_tail` of it comes late. `light`: of surfaces, as a
+    pulse of an instant would show it, but for what light between rows is spread.
     """
-    width = frames.camera.pulse_fwhm / frames.bin_width
-    usual = ShotPulse(width / FWHM_PER_SIGMA)
-    if pixels.size == 0:
-        return usual
     lags = np.arange(-int(np.ceil(REACH_BEFORE * width)), int(np.ceil(REACH_AFTER * width)) + 1)
-    shape = find_usual_course(frames, pixels, distance, lags, width)
-    ratio = Pulse(shape, 1.0, 0.0).fwhm / width
-    if ratio < SHORTER:  # than the camera says, as where nobody told it
-        shorter = frames.camera.replace(pulse_fwhm=ratio * frames.camera.pulse_fwhm)
-        return measure_pulse(replace(frames, camera=shorter), pixels, distance)
-    tail = float(shape[lags > TAIL_START * width].sum() / shape.sum())
-    if ratio < GAUSSIAN_WIDTH and tail < GAUSSIAN_TAIL:
-        return usual
+    course = find_course(light, image, weights, lags)
+    left = SPLINE_LEFT_VARIANCE / 2
+    whole = np.convolve(course, [left, 1 - 2 * left, left], "same")
+    own = Pulse(np.maximum(whole, 0), 1.0, 0.0).fwhm
+    tail = float(course[lags > TAIL_START * width].sum() / course.sum())
+    if tail < least_tail:
+        usual = width if NARROW < own / width < WIDE else own
+        return ShotPulse(usual / FWHM_PER_SIGMA, tail_share=tail)
     # A Gaussian core at some lags, by non-negative least squares: the widest that explains the pulse
     # as well as any. One that explains nothing better than the samples' own roundness is too narrow.
-    allowed = lags[lags >= -LAGS_BEFORE * width]
-    cores = CORES * width / FWHM_PER_SIGMA
-    designs = (np.exp(-(((lags[:, np.newaxis] - allowed) / core) ** 2) / 2) for core in cores)
-    fits = [scipy.optimize.nnls(design, shape) for design in designs]
+    allowed = lags[lags >= -LAGS_BEFORE * own]
+    sigmas = CORES * own / FWHM_PER_SIGMA
+    variances = np.maximum(sigmas**2 - SPLINE_LEFT_VARIANCE, MIN_VARIANCE)
+    designs = (np.exp(-((lags[:, np.newaxis] - allowed) ** 2) / 2 / one) for one in variances)
+    fits = [scipy.optimize.nnls(design, course) for design in designs]
     enough = CORE_EXCESS * min(misfit for _, misfit in fits) + 1e-9
     best = max(number for number, (_, misfit) in enumerate(fits) if misfit <= enough)
     shares = fits[best][0]
     kept = shares > LEAST_SHARE * shares.sum()
-    # where the pulse is at its peak is its return, as for a search of returns
-    sigma = float(np.sqrt(max(cores[best] ** 2 - ROW_VARIANCE, ROW_VARIANCE)))
-    own = allowed[kept].astype(np.intp)
-    return ShotPulse(sigma, own, shares[kept] / shares[kept].sum(), tail)
+    own_lags = allowed[kept].astype(np.intp)
+    return ShotPulse(float(sigmas[best]), own_lags, shares[kept] / shares[kept].sum(), tail)
 
 
-def find_usual_course(
-    frames: Frames,
-    pixels: NDArray[np.intp],
-    distance: FloatArray,
-    lags: NDArray[np.int64],
-    width: float,
-) -> FloatArray:
-    """Return the median course of light about the returns of bright pixels, its peak 1, at lags, rows
-    after the return; `width`: of the camera's pulse, rows.
-    """
-    traces = frames.values.reshape(frames.values.shape[0], -1)
-    row = np.interp(2 * distance / SPEED_OF_LIGHT, frames.times, np.arange(frames.times.size))
-    place = row[:, np.newaxis] + lags
-    before = np.clip(np.floor(place).astype(np.intp), 0, len(traces) - 2)
-    between = np.clip(place - before, 0, 1)
-    own = pixels[:, np.newaxis]
-    light = traces[before, own] * (1 - between) + traces[before + 1, own] * between
-    core = light[:, np.abs(lags) <= width].sum(axis=1)
-    usual = float(np.quantile(core, BRIGHT_QUANTILE))
-    bright = core >= max(usual, float(np.finfo(np.float32).tiny))
-    shape = np.median(light[bright] / core[bright, np.newaxis], axis=0)
-    return np.asarray(shape / max(float(shape.max()), float(np.finfo(np.float64).tiny)))
+def find_course(light: Image, image: Image, weights: Image, lags: NDArray[np.int64]) -> FloatArray:
+    """Return how much light comes at each lag, rows, as least squares of the image."""
+    before, after = int(-lags[0]), int(lags[-1])
+    lit = np.flatnonzero(light.any(axis=1))
+    rows = slice(max(int(lit.min(initial=0)) - before, 0), int(lit.max(initial=0)) + after + 1)
+    some = rows, slice(None, None, 1 + np.count_nonzero(light) // SHOWN)
+    image, root = image[some], np.sqrt(weights[some])
+    seen = np.pad(light[some], ((after, before), (0, 0)))
+    shifted = np.lib.stride_tricks.sliding_window_view(seen, len(image), axis=0)
+    moved = np.stack([(shifted[after - lag].T * root).ravel() for lag in lags])
+    information = moved @ moved.T
+    usual = np.trace(information) / lags.size
+    information += COURSE_RIDGE * max(float(usual), TINY) * np.eye(lags.size, dtype=np.float32)
+    pull = moved @ (image * root).ravel()
+    return np.linalg.solve(information.astype(np.float64), pull.astype(np.float64))
 
 
 def make_pulse(sigma: float, half: int, variance: float = SPLINE_LEFT_VARIANCE) -> Image:

@@ -59,8 +59,8 @@ ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 6, 2
 # What the prior takes from amplitudes is as fine as they are. After 6 the ranges of a wall behind
 # wires were 0.009 mm too near, without noise and with the model exact; after 15, 0.0005 mm.
 FREE_ITERATIONS, FURTHER_FREE_ITERATIONS, MOVED_FREE_ITERATIONS = 15, 6, 3
-# Middle of a part of a pixel from the pixel's own, root mean square over parts of all sizes.
-PARTLY_FILLED_PX = 1 / np.sqrt(12)
+# By which the middle of a part of a pixel is off from where `fill_partly` puts it, root mean square.
+LEFT_ASIDE_PX = 0.2
 # Of local shifts: the side of the square that moves together, and the least that is known of one.
 LOCAL_PX, LEAST_INFORMATION = 5, 1.0
 
@@ -169,11 +169,16 @@ def _differentiate_sweep(model: SurfaceModel, amplitude: Image, view: int) -> li
 
 
 def _differentiate_borders(model: SurfaceModel, amplitude: Image, _: int) -> list[Derivatives]:
+    """What a view sees further comes half a pixel beyond its outer columns' middles."""
     windows = []
     for view, kernel in enumerate(model.kernels):
         light = np.zeros_like(amplitude)
         light[model.outer] = amplitude[model.outer] * model.excess[view]
-        windows.append(model.receive(view, light, kernel))
+        for way in (-1, 1):
+            side = np.where(model.column == 0, -1, 1) == way
+            seen = model.receive(view, light * side, kernel)
+            beyond = scipy.ndimage.shift(seen.images, (0, 0, way), order=0)
+            windows.append(replace(seen, images=(seen.images + beyond) / 2))
     return [*_join_windows(model, [("borders", 0, 0)], windows)]
 
 
@@ -328,6 +333,7 @@ def refine_state(
     place; the mean gain stays, and so does the mean brightness behind a surface. What the step
     before this one (`earlier`) knew saves work. Without the `instrument`, on ranges alone.
     """
+    model.fill_partly(amplitude)
     given, model.weights = model.weights, doubt_borders(model, amplitude)
     error = model.image - model.render(amplitude)
     scale = scale_amplitude(model, amplitude > 0)
@@ -428,7 +434,7 @@ def doubt_borders(model: SurfaceModel, amplitude: Image) -> Image:
     own = np.arange(amplitude.size)
     light = [[np.where(side == own, 0, amplitude[side]) for side in pair] for pair in model.beside]
     uneven = [np.abs(a - b) / np.maximum(a + b, TINY) for a, b in light]
-    late = PARTLY_FILLED_PX * np.hypot(*(np.array(uneven) * model.compute_slopes())) / model.row_m
+    late = LEFT_ASIDE_PX * np.hypot(*(np.array(uneven) * model.compute_slopes())) / model.row_m
     late *= np.array([not isinstance(basis, QuadricBasis) for basis in model.bases])[model.surface]
     moved = delay_light(model).render((amplitude * late).astype(np.float32))
     return model.weights / (1 + model.weights * moved**2)

@@ -10,6 +10,7 @@ import scipy
 from tofclip.camera import measure
 from tofclip.errors import InputError
 from tofclip.lidar import Detection
+from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
 from tofclip.recovery.surfaces.fit import (
     MAX_REFINEMENTS,
     REFINEMENT_ITERATIONS,
@@ -19,6 +20,7 @@ from tofclip.recovery.surfaces.fit import (
 from tofclip.recovery.surfaces.model import SurfaceModel, find_rows
 from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, Image
 from tofclip.recovery.surfaces.returns import list_returns
+from tofclip.recovery.surfaces.start import call_dark, estimate_darkness
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import Method, Progress, Sparse, TotalVariation, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
@@ -100,10 +102,12 @@ class SurfaceRecovery:
         Raises
         ------
         InputError
-            Most of the light does not come from surfaces.
+            Most of the light does not come from surfaces, or none stands out of the noise.
         """
         fit = fit_surfaces(streak, frames, self.weight, self.iterations, progress)
         returns = list_returns(fit, self.detection, centre_error_px)
+        if not np.any(returns.false_alarm <= DEFAULT_FALSE_ALARM):
+            raise call_dark(estimate_darkness(streak, frames))
         model, amplitude, camera = fit.whole.model, fit.whole.amplitude, returns.camera
         # Rectified like every other method's: its residual is of measurements, not of raw pixels.
         predicted, measured = (

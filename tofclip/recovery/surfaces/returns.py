@@ -24,7 +24,7 @@ from tofclip.recovery.surfaces.fit import (
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.patches import rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
-from tofclip.recovery.surfaces.ranges import PARTLY_FILLED_PX, measure_local_shifts
+from tofclip.recovery.surfaces.ranges import measure_local_shifts
 from tofclip.recovery.surfaces.shapes import TINY, Pixels
 from tofclip.shots import Returns
 from tofclip.threads import limit_blas_threads
@@ -48,6 +48,8 @@ SHIFT_SHOWN = 1 / 3
 # resolves; and by how much of a pixel's width, root mean square, its points are off for that: those
 # of rods of 10 and 12 mm are off by 0.07 to 0.17.
 ROD_FRACTION, ROD_PX = 0.1, 0.12
+# Middle of a part of a pixel from the pixel's own, root mean square over parts of all sizes.
+PART_PX = 1 / np.sqrt(12)
 
 
 @limit_blas_threads()
@@ -120,7 +122,7 @@ def estimate_hidden_shift(model: SurfaceModel, amplitude: Image) -> FloatArray:
     light = np.empty(amplitude.size)
     light[order] = before - np.maximum.accumulate(np.where(rank == 0, before, 0))
     fraction = light / np.maximum(light + amplitude, TINY)
-    aside = fraction * PARTLY_FILLED_PX / np.sqrt(model.camera.views)
+    aside = fraction * PART_PX / np.sqrt(model.camera.views)
     return np.asarray(aside * np.hypot(*model.compute_slopes()))
 
 

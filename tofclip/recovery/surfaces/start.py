@@ -4,6 +4,9 @@ picture. What is no shot of surfaces (smoke, light in flight, relay walls) is re
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+from typing import Any
+
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -12,7 +15,7 @@ from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, estimate_dark_level, measure
 from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
-from tofclip.lidar import compute_ray_directions
+from tofclip.lidar import compute_ray_directions, depth
 from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver
 from tofclip.recovery.surfaces.model import (
     SMOOTHING_PX,
@@ -29,13 +32,16 @@ from tofclip.recovery.surfaces.patches import (
     find_plain_patches,
     reach_further,
 )
-from tofclip.recovery.surfaces.pulse import Image, measure_pulse
+from tofclip.recovery.surfaces.pulse import Image, ShotPulse
 from tofclip.recovery.surfaces.shapes import Pixels
 from tofclip.shots import Frames, Returns, Streak
 from tofclip.units import SPEED_OF_LIGHT
 
 SURE_FALSE_ALARM = 0.04  # of a return that makes a surface
 MIN_SURE_FRACTION = 0.8  # of a patch's returns
+# Of the signal, noise that hides surfaces from single pixels (0.2 to 0.7 in 50 photons, 0.1 in 200), and
+# the standard deviation of the mean over pixels that is then looked at.
+DARK, POOLED_PX = 0.15, 1.0
 
 # Of the returns' light: below, the shot is not one of surfaces. Simulated shots of surfaces have 0.93
 # or more, recorded ones 0.97; recorded relay walls have 0.50 to 0.79.
@@ -58,15 +64,15 @@ SLOPE_WINDOW_PX = 7
 
 
 def find_surfaces(found: Returns, streak: Streak, frames: Frames, weight: float) -> AmplitudeSolver:
-    """Find the surfaces that the returns of frames show, and the shot's pulse; refuse what is no shot
-    of surfaces.
-    """
+    """Find the surfaces that the returns of frames show; refuse what is no shot of surfaces."""
     camera, bin_m = frames.camera, SPEED_OF_LIGHT * frames.bin_width / 2
     ray_length = measure_rays(camera)
     _require_gentle_slopes(found, bin_m)
 
     # 2. Patches.
     shown = _leave_out_doubtful(found, ray_length, bin_m)
+    if estimate_darkness(streak, frames) > DARK:
+        shown = _add_pooled(shown, frames, ray_length, bin_m)
     patches = find_brightest_patches(shown, ray_length, bin_m)
     on_surface = np.zeros(camera.image_shape, bool)
     for patch in patches:
@@ -75,19 +81,30 @@ def find_surfaces(found: Returns, streak: Streak, frames: Frames, weight: float)
     if share < MIN_SURFACE_SHARE:
         raise _refuse(f"only {100 * share:.0f} % of the returns' light lies on smooth surfaces")
     patches += find_dimmer_patches(patches, shown, ray_length, bin_m)
-    seen = np.concatenate([patch.pixels for patch in patches])
-    pulse = measure_pulse(frames, seen, shown.image("range").astype(np.float64).ravel()[seen])
-    if pulse.tail_share > MAX_TAIL_SHARE:
-        late = 100 * pulse.tail_share
-        raise _refuse(f"{late:.0f} % of each pixel's light comes long after its peak")
-
     # 3. A surface may reach beyond its returns: measurements decide where it ends.
     masks, amplitude = lay_out(patches, shown, frames.values.sum(axis=0), bin_m)
     state = SurfaceState.start([patch.coefficients for patch in patches], camera)
     bases = [patch.basis for patch in patches]
-    return AmplitudeSolver(
-        SurfaceModel(streak, camera, masks, bases, state, pulse), amplitude, weight
-    )
+    model = SurfaceModel(streak, camera, masks, bases, state)
+    return AmplitudeSolver(model, amplitude, weight)
+
+
+def _add_pooled(shown: Returns, frames: Frames, ray_length: FloatArray, bin_m: float) -> Returns:
+    """Add what pixels without a return show together with those about them: of a surface in little light
+    none alone is out of the noise, but many beside each other are at one range.
+    """
+    pooled = scipy.ndimage.gaussian_filter(frames.values, (0, POOLED_PX, POOLED_PX))
+    pooled[:, shown.y, shown.x] = frames.values[:, shown.y, shown.x]
+    found = depth(replace(frames, values=pooled), shown.camera)
+    found = _leave_out_doubtful(found, ray_length, bin_m)
+    alone = np.zeros(ray_length.shape, bool)
+    alone[shown.y, shown.x] = True
+    found = found[~alone[found.y, found.x]]
+    columns = (one.name for one in fields(Returns) if one.name not in ("camera", "provenance"))
+    both: dict[str, Any] = {
+        name: np.append(getattr(shown, name), getattr(found, name)) for name in columns
+    }
+    return replace(shown, **both)
 
 
 def measure_rays(camera: Camera) -> FloatArray:
@@ -207,6 +224,21 @@ def estimate_darkness(streak: Streak, frames: Frames) -> float:
     signal = np.linalg.norm(scipy.ndimage.gaussian_filter(image, SMOOTHING_PX))
     # what is left of the variance of neighbours' mean
     return float(np.sqrt(variance / (4 * np.pi)) / SMOOTHING_PX / max(signal, LEAST_COUNT))
+
+
+def call_dark(darkness: float) -> InputError:
+    """Return a refusal of a shot in whose noise no surface stands out."""
+    return InputError(
+        f"noise is {100 * darkness:.0f} % of this shot's signal: it is too dark for surfaces; "
+        'choose `method="tv"`, or average shots'
+    )
+
+
+def require_pulse(pulse: ShotPulse) -> None:
+    """Refuse a shot whose light follows no pulse."""
+    if pulse.tail_share > MAX_TAIL_SHARE:
+        late = 100 * pulse.tail_share
+        raise _refuse(f"{late:.0f} % of each pixel's light comes long after its peak")
 
 
 def require_explained(whole: AmplitudeSolver, limit: float, frames: Frames, streak: Streak) -> None:
