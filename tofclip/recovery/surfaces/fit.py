@@ -171,6 +171,8 @@ def _measure_pulse(solver: AmplitudeSolver) -> AmplitudeSolver:
     least_tail = max(LEAST_TAIL, LEAST_EXPLAINED * model.unexplained(solver.amplitude))
     pulse = measure_pulse(light, model.image, model.weights, width, least_tail)
     require_pulse(pulse)
+    if (pulse.sigma, pulse.reach) == (model.pulse.sigma, 0):
+        return solver
     return AmplitudeSolver(model.respond(pulse), solver.amplitude, solver.weight, solver)
 
 
