@@ -135,7 +135,7 @@ def test_a_stream_of_rows_far_shorter_than_the_pulse_shows_what_its_shots_show(c
     assert len(alone) >= len(found) > 0.9 * len(alone) > 100
     own = {(y, x): r for y, x, r in zip(alone.y, alone.x, alone.range, strict=True)}
     assert all(own[y, x] == r for y, x, r in zip(found.y, found.x, found.range, strict=True))
-    # a camera's sweep is told in the rows of the shots
+    # a camera's sweep counts the rows of the shots
     assert found.camera.sweep == alone.camera.sweep == camera.sweep
     later = follow(pipeline, second)
     assert pipeline.searches == 1

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.model import SurfaceModel
-from tofclip.recovery.surfaces.pulse import Image
+from tofclip.recovery.surfaces.pulse import TINY, Image
 
 PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
 # At least and at most, until norms change by as little: where many surfaces share measurements it takes long
@@ -30,7 +30,6 @@ CAPPED_COST = 0.5
 SETTLED_SIGMAS = 0.003
 MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
-TINY = float(np.finfo(np.float32).tiny)
 
 Tick = Callable[[], object]
 

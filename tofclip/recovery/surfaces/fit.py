@@ -137,13 +137,14 @@ def _fit_returns(
     tick: Tick,
 ) -> SurfaceFit:
     """Fit the surfaces that returns show."""
-    solver = find_surfaces(found, streak, frames, weight)
+    darkness = estimate_darkness(streak, frames)
+    solver = find_surfaces(found, streak, frames, weight, darkness)
 
     # 4. Amplitudes, and the pulse as they show it.
     solver.run(PULSE_ITERATIONS, tick, AGAINST_DIM)
     solver = _measure_pulse(solver)
     solver.run(START_ITERATIONS - PULSE_ITERATIONS, tick, AGAINST_DIM)
-    limit = np.hypot(MAX_UNEXPLAINED, estimate_darkness(streak, frames))
+    limit = np.hypot(MAX_UNEXPLAINED, darkness)
     if solver.model.unexplained(solver.amplitude) > limit:
         # what is too small for a surface may be all that is bright
         _, whole = _find_others(solver, found, tick)

@@ -35,6 +35,7 @@ from tofclip.recovery.surfaces.pulse import (
     EXTENT_SIGMAS,
     FWHM_PER_SIGMA,
     SPLINE_LEFT_VARIANCE,
+    TINY,
     Image,
     ShotPulse,
     make_pulse,
@@ -56,7 +57,6 @@ SLIT_PIXELS = 4
 # a pulse of a row or more does not tell so narrow a ramp from an instant
 PART_ROWS, MAX_PARTS = 1.5, 6
 LEAST_FILLED = 0.1  # of a pixel's side, by a surface that ends in it
-TINY = float(np.finfo(np.float32).tiny)
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
 SWEEP_LEFT_FRACTION = 0.15  # of the corrections to a sweep, lines: what is left of its shape
@@ -373,9 +373,8 @@ class SurfaceModel:
         """Put the light of pixels that a surface fills in part on the side of the brighter of the pixels
         beside them: as much as is missing from what these, going on as they do, would make it.
         """
-        own = np.arange(amplitude.size)
         beyond = np.take_along_axis(self.beside, self.beside, axis=-1)
-        before, behind = np.where(self.beside == own, 0, amplitude[self.beside]).swapaxes(0, 1)
+        before, behind = self.find_light_beside(amplitude).swapaxes(0, 1)
         ahead, after = amplitude[beyond].swapaxes(0, 1)
         dark, bright = np.minimum(before, behind), np.maximum(before, behind)
         further = np.where(behind > before, after, ahead)
@@ -387,6 +386,11 @@ class SurfaceModel:
         )
         self.aside = np.where(behind > before, away, -away).astype(np.float64)
         self.place(self.state)
+
+    def find_light_beside(self, amplitude: Image) -> Image:
+        """Return the amplitudes of the points beside each, as `beside`, (2, 2, points); 0 where none is."""
+        own = np.arange(amplitude.size)
+        return np.where(self.beside == own, 0, amplitude[self.beside])
 
     def _find_neighbours(self) -> NDArray[np.intp]:
         """Numbers of the points of the same surface beside each, (2, 2, points): along columns and

@@ -22,13 +22,12 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.recovery.surfaces.amplitudes import (
-    TINY,
     explain_by_amplitude,
     scale_amplitude,
     share_misfit,
 )
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, Window
-from tofclip.recovery.surfaces.pulse import Image, differentiate_pulse
+from tofclip.recovery.surfaces.pulse import TINY, Image, differentiate_pulse
 from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, Pixels, QuadricBasis
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -378,7 +377,7 @@ def refine_state(
         covariance += PULL_SIGMAS**2 * np.outer(pull, pull)
 
     # 4. The step's length.
-    moved, free, rest = _take_step(model, amplitude, (excess, scale), names, newton, changes)
+    moved, free, rest = _take_step(model, amplitude, (error, excess, scale), names, newton, changes)
     numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
     own = [np.ix_(numbers == surface, numbers == surface) for surface in range(len(model.masks))]
     covariances = [covariance[block] for block in own]
@@ -390,20 +389,20 @@ def refine_state(
 def _take_step(
     model: SurfaceModel,
     amplitude: Image,
-    begun: tuple[Image, Image],
+    begun: tuple[Image, Image, Image],
     names: list[Unknown],
     newton: FloatArray,
     changes: Image,
 ) -> tuple[Image, Image, Image]:
     """Move the model as far along a step as each surface's own misfit allows: those that explain less than
     before go less far, and do not hold the others back. Return the amplitudes that go along, those that
-    explain the shot best then, and what is left of it. `begun`: what amplitudes change to explain it before
-    the step, and their scales.
+    explain the shot best then, and what is left of it. `begun`: before the step, the misfit, what
+    amplitudes change to explain it, and their scales.
 
     There are as many iterations before the step as after it, so that these alone do not make it good. A
     step that is far too long may overflow: it is refused like others that lower nothing.
     """
-    state, error, (excess, scale) = model.state, model.image - model.render(amplitude), begun
+    state, (error, excess, scale) = model.state, begun
     settled, rest = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
     before = compute_objective(model, rest)
     ranges = "coefficients", "patterns", "shading"
@@ -432,8 +431,7 @@ def doubt_borders(model: SurfaceModel, amplitude: Image) -> Image:
     add to their variance: their light comes from any part of the pixel, and where the surface is steep
     that is a range of its own, by which the whole of it would be turned or moved.
     """
-    own = np.arange(amplitude.size)
-    light = [[np.where(side == own, 0, amplitude[side]) for side in pair] for pair in model.beside]
+    light = model.find_light_beside(amplitude)
     uneven = [np.abs(a - b) / np.maximum(a + b, TINY) for a, b in light]
     late = LEFT_ASIDE_PX * np.hypot(*(np.array(uneven) * model.compute_slopes())) / model.row_m
     late *= np.array([not isinstance(basis, QuadricBasis) for basis in model.bases])[model.surface]

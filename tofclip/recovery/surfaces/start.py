@@ -63,15 +63,19 @@ STEEP_BINS, MAX_STEEP_SHARE = 10.0, 0.3
 SLOPE_WINDOW_PX = 7
 
 
-def find_surfaces(found: Returns, streak: Streak, frames: Frames, weight: float) -> AmplitudeSolver:
-    """Find the surfaces that the returns of frames show; refuse what is no shot of surfaces."""
+def find_surfaces(
+    found: Returns, streak: Streak, frames: Frames, weight: float, darkness: float
+) -> AmplitudeSolver:
+    """Find the surfaces that the returns of frames show; refuse what is no shot of surfaces. `darkness`:
+    of `estimate_darkness`.
+    """
     camera, bin_m = frames.camera, SPEED_OF_LIGHT * frames.bin_width / 2
     ray_length = measure_rays(camera)
     _require_gentle_slopes(found, bin_m)
 
     # 2. Patches.
     shown = _leave_out_doubtful(found, ray_length, bin_m)
-    if estimate_darkness(streak, frames) > DARK:
+    if darkness > DARK:
         shown = _add_pooled(shown, frames, ray_length, bin_m)
     patches = find_brightest_patches(shown, ray_length, bin_m)
     on_surface = np.zeros(camera.image_shape, bool)
@@ -81,6 +85,7 @@ def find_surfaces(found: Returns, streak: Streak, frames: Frames, weight: float)
     if share < MIN_SURFACE_SHARE:
         raise _refuse(f"only {100 * share:.0f} % of the returns' light lies on smooth surfaces")
     patches += find_dimmer_patches(patches, shown, ray_length, bin_m)
+
     # 3. A surface may reach beyond its returns: measurements decide where it ends.
     masks, amplitude = lay_out(patches, shown, frames.values.sum(axis=0), bin_m)
     state = SurfaceState.start([patch.coefficients for patch in patches], camera)
