@@ -40,7 +40,7 @@ MEASURED = (
     "tofclip.solvers.denoising.NonlocalMeans",
     "tofclip.solvers.denoising.CollaborativeWiener",
     *("tofclip.lidar.Detection", "tofclip.lidar.photons.PhotonDetector"),
-    *("tofclip.lidar.photons.Smoothness", "tofclip.simulate.StreakDetector"),
+    "tofclip.simulate.StreakDetector",
     *("tofclip.recovery.SurfaceRecovery", "tofclip.recovery.DepthLockedFocus"),
     *("tofclip.recovery.FixedFocus", "nlos.Refinement", "nlos.refinement.l1.build_total_variation"),
     "nlos.refinement.photons.PhotonRefinement",

@@ -3,29 +3,13 @@
 ::
 
     TofclipError
-    +-- InputError              (ValueError)   the caller passed something unusable
-    |   +-- ShapeError                         an array has the wrong shape
-    |   +-- CalibrationError                   a camera disagrees with its data or with itself
-    |   +-- MissingTimeAxisError               a streak image does not say how long a row lasts
-    +-- FileFormatError         (ValueError)   a file is damaged, incomplete or of another format
-    +-- StorageError            (OSError)      a file could not be read or written: disk full, no
-      permission
-    +-- MissingDependencyError  (ImportError)  an optional library is not usable on this machine
-    +-- DeviceError             (OSError)      an instrument, or the way to it, does not do what it
-      should
-        +-- UsbBackendError                    there is no libusb on this machine
-        +-- DeviceNotFoundError                no such instrument is connected
-        +-- DevicePermissionError              this user may not talk to it
-        +-- DeviceBusyError                    another program talks to it
-        +-- DeviceTimeoutError  (TimeoutError) it sent nothing in time
-        +-- DeviceStalledError                 an endpoint stalled, and stalled again after it was
-          cleared
-        +-- DeviceDisconnectedError            it was unplugged, or the connection broke, and did
-          not come back
-        +-- TransferOverflowError              it sent more than was asked for, and the transfer is
-          lost
-        +-- BufferOverflowError                the records came faster than they were read
-        +-- ProtocolError                      it said what its protocol does not allow
+    +-- InputError (ValueError): ShapeError, CalibrationError, MissingTimeAxisError
+    +-- FileFormatError (ValueError)
+    +-- StorageError (OSError)
+    +-- MissingDependencyError (ImportError)
+    +-- DeviceError (OSError): UsbBackendError, DeviceNotFoundError, DevicePermissionError,
+          DeviceBusyError, DeviceTimeoutError (TimeoutError), DeviceStalledError,
+          DeviceDisconnectedError, TransferOverflowError, BufferOverflowError, ProtocolError
 
 A message is one line that says what was wrong and what to do about it. An argument that would help is
 named as in Python, in backquotes (`bin_width`); the command line puts its option in that place
@@ -76,7 +60,7 @@ class FileFormatError(TofclipError, ValueError):
 
 
 class StorageError(TofclipError, OSError):
-    """A file could not be read or written."""
+    """A file could not be read or written: the disk is full, there is no permission."""
 
 
 class MissingDependencyError(TofclipError, ImportError):

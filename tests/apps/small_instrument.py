@@ -16,7 +16,6 @@ from apps.cli import main
 from tofclip.camera import Camera, SkewSweep
 from tofclip.io.light_fields import write_light_field
 from tofclip.lidar import compute_ray_directions
-from tofclip.lidar.photons import make_pinhole
 from tofclip.light_field import LightField
 from tofclip.light_field.views import CameraSetup, measure
 from tofclip.shots import Streak
@@ -133,7 +132,7 @@ def save_plate(path, distance, photons, seed, late):
     """Save the photon cube, (5, 6, 80) with bins of 80 ps, of a plate [m] so many seconds late."""
     noise = np.random.default_rng(seed)
     y, x = np.indices((5, 6)).reshape(2, -1)
-    cosine = compute_ray_directions(make_pinhole((5, 6), 20.0, 400e-12), y, x)[:, 2]
+    cosine = compute_ray_directions(Camera.pinhole((5, 6), 20.0, 400e-12), y, x)[:, 2]
     time = 2 * distance / cosine / SPEED_OF_LIGHT + late
     cube = noise.poisson(0.02, (y.size, 80))
     pixel = np.repeat(np.arange(y.size), noise.poisson(photons * cosine))

@@ -6,8 +6,8 @@ import pytest
 import scipy.io
 import tifffile
 
+from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.lidar.photons import make_pinhole
 from tofclip.lidar.photons.files import describe_photons, read_photons
 
 BIN = 80e-12
@@ -232,7 +232,7 @@ def test_one_row_or_one_pixel_where_axes_are_told(shape, counts, tmp_path):
     described = describe_photons(path)
     assert described["arrays"] == {"array": f"{BINS} x {shape[0]} x {shape[1]} uint16"}
     assert "give --axes" in described["axes"]
-    assert make_pinhole(shape, 10.0, BIN).image_shape == shape
+    assert Camera.pinhole(shape, 10.0, BIN).image_shape == shape
 
 
 def test_time_is_recognised_by_its_peak_where_it_is_not_the_longest(tmp_path):

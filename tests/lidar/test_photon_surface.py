@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
+from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.lidar import Pulse
 from tofclip.lidar.photons import (
     PhotonImage,
     estimate_surface,
-    make_pinhole,
     matching,
 )
 from tofclip.lidar.photons.image import find_hot_pixels, leave_out_pixels
@@ -119,7 +119,7 @@ def test_two_layers_are_both_found_and_none_twice():
         assert np.mean((hits[0] > 0) & (hits[1] > 0)) >= 0.95
         assert np.mean((hits[0] > 1) | (hits[1] > 1)) <= 0.02
         assert np.mean(np.isfinite(ranges).sum(axis=0) > 2) <= 0.02
-    returns = found.to_returns(make_pinhole(found.range.shape, 60.0, FWHM))
+    returns = found.to_returns(Camera.pinhole(found.range.shape, 60.0, FWHM))
     assert len(returns) == np.isfinite(ranges).sum()
     assert returns.return_number.max() >= 2
     one_pixel = (returns.y == 24) & (returns.x == 30)

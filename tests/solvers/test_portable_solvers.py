@@ -10,7 +10,7 @@ from array_places import DEVICE_NAMES, find_device
 
 from tofclip.arrays import ComputeDevice, to_numpy
 from tofclip.errors import InputError
-from tofclip.operators import Diagonal, FourierShear, LineProjection, Stack, estimate_squared_norm
+from tofclip.operators import Diagonal, LinearShear, LineProjection, Stack, estimate_squared_norm
 from tofclip.solvers import (
     Backprojection,
     Fista,
@@ -153,15 +153,15 @@ def test_no_step_waits_for_the_device(prior, monkeypatch):
 
 def test_what_has_only_compiled_loops_says_so(device):
     measurements = device.put(letters(2)[0])
-    shear = FourierShear((24, 23), 0.5, (1, 1))
+    shear = LinearShear((24, 23), 0.5, (1, 1))
     stack, picture = Stack([projection() @ shear, projection()]), np.zeros((24, 23), np.float32)
     for what, attempt in (
         ("the prior Wavelets", lambda: Wavelets().recover(projection(), measurements)),
         ("LightFieldVariation", lambda: LightFieldVariation().recover(projection(), measurements)),
         ("a denoiser", lambda: PlugAndPlay(Sparse()).recover(projection(), measurements)),
         ("weight", lambda: choose_weight(Sparse(), projection(), measurements[:, 0], 5)),
-        ("FourierShear", lambda: stack.H.H(device.put(picture))),
-        ("FourierShear", lambda: Sparse().recover(projection() @ shear, measurements)),
+        ("LinearShear", lambda: stack.H.H(device.put(picture))),
+        ("LinearShear", lambda: Sparse().recover(projection() @ shear, measurements)),
     ):
         with pytest.raises(InputError, match=f"{what} works on NumPy arrays"):
             attempt()

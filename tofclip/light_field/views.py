@@ -27,7 +27,7 @@ from tofclip.errors import (
 )
 from tofclip.operators import LinearShear
 from tofclip.operators.cameras import CAMERAS, EvenAngleLineCamera, LightFieldCamera
-from tofclip.operators.shear import View
+from tofclip.operators.codes import View
 from tofclip.operators.sparse import SparseMatrix
 from tofclip.storage import (
     Storable,

@@ -14,6 +14,7 @@ from .base import ViewSelection as ViewSelection
 from .base import estimate_squared_norm as estimate_squared_norm
 from .codes import DenseSensor as DenseSensor
 from .codes import HadamardCodes as HadamardCodes
+from .codes import LinearShear as LinearShear
 from .codes import MaskedSensor as MaskedSensor
 from .codes import MaskedViews as MaskedViews
 from .codes import PitchedSensor as PitchedSensor
@@ -21,8 +22,6 @@ from .codes import ShearedViews as ShearedViews
 from .codes import WeightedViews as WeightedViews
 from .convolution import PointSpreadConvolution as PointSpreadConvolution
 from .convolution import SliceConvolution as SliceConvolution
-from .radon import RadonProjection as RadonProjection
-from .shear import FourierShear as FourierShear
-from .shear import LinearShear as LinearShear
 from .sparse import LineProjection as LineProjection
+from .sparse import RadonProjection as RadonProjection
 from .sparse import SparseMatrix as SparseMatrix

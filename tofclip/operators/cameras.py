@@ -30,9 +30,11 @@ from tofclip.operators.base import (
 from tofclip.operators.codes import (
     DenseSensor,
     HadamardCodes,
+    LinearShear,
     MaskedViews,
     PitchedSensor,
     ShearedViews,
+    View,
     WeightedViews,
     make_sheared_mask,
 )
@@ -48,8 +50,7 @@ from tofclip.operators.convolution import (
     shear_point_spreads,
     trace_view_point_spreads,
 )
-from tofclip.operators.radon import RadonProjection
-from tofclip.operators.shear import LinearShear, View
+from tofclip.operators.sparse import RadonProjection
 
 __all__ = [
     *("CAMERAS", "COMPRESSIVE_CAMERAS", "AshokCamera", "BabacanCamera", "CodedApertureCamera"),

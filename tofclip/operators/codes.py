@@ -1,5 +1,6 @@
-"""What turns light into measurements: which pixels of a sensor are read, the codes of a single pixel,
-and how masks weigh the views of a light field (supplement Note 5).
+"""What turns light into measurements: the shear, from the refocused picture to what a view sees
+(supplement Eq. 3); which pixels of a sensor are read, the codes of a single pixel, and how masks
+weigh the views of a light field (supplement Note 5).
 """
 
 from __future__ import annotations
@@ -20,7 +21,49 @@ from tofclip.operators.base import (
     Reshape,
     Selection,
 )
-from tofclip.operators.shear import LinearShear, View
+
+View = tuple[float, float]
+
+
+class LinearShear(LinearOperator):
+    """A shift of the whole picture by s times the view's distance from the reference view, with linear
+    interpolation between neighbouring pixels; dark beyond the border.
+
+    View (v, u) sees ``p(x, y) = h(x - s (u - u_ref), y - s (v - v_ref))``, s being the shear in
+    pixels per view step; the reference may lie anywhere (viewpoint synthesis). The adjoint is the
+    opposite shift, exactly.
+    """
+
+    def __init__(
+        self,
+        image_shape: tuple[int, int],
+        shear: float,
+        view: View,
+        reference: View = (0.0, 0.0),
+        dtype: DTypeLike = np.float32,
+    ) -> None:
+        super().__init__(image_shape, image_shape, dtype)
+        self.shift_px = tuple(float(shear * (a - b)) for a, b in zip(view, reference, strict=True))
+        require(
+            np.all(np.abs(self.shift_px) < np.asarray(image_shape)),
+            f"shear {shear} moves view {view} by {self.shift_px} px, out of a {image_shape} picture; "
+            "take a shear nearer to zero",
+        )
+
+    def _forward(self, block: Array) -> Array:
+        return self._shift(block, *self.shift_px)
+
+    def _adjoint(self, block: Array) -> Array:
+        return self._shift(block, *(-shift for shift in self.shift_px))
+
+    def _shift(self, block: Array, down: float, right: float) -> Array:
+        from tofclip.operators.kernels import shift_linearly
+
+        rows, columns = (int(np.floor(shift)) for shift in (down, right))
+        below, beside = np.array([down - rows, right - columns], self.dtype)
+        shifted = np.empty_like(block)
+        shift_linearly(block, rows, columns, below, beside, shifted)
+        return shifted
 
 
 class DenseSensor(Reshape):

@@ -19,7 +19,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from tofclip.compiling import SUMS_AS_WRITTEN, compile_as_part, compile_loop, inlined
-from tofclip.operators.radon import FRACTION_BITS
+from tofclip.operators.sparse import FRACTION_BITS
 from tofclip.threads import LANES
 
 INDEX_TYPE = ir.IntType(64)

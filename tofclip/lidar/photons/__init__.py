@@ -14,14 +14,10 @@ from tofclip.lidar.photons.detector import (
     correct_pile_up,
     estimate_pixels,
 )
-from tofclip.lidar.photons.image import PhotonCube, PhotonImage, SurfaceImage, make_pinhole
+from tofclip.lidar.photons.image import PhotonCube, PhotonImage, SurfaceImage
 from tofclip.lidar.photons.limits import Accuracy, compute_range_bound, measure_accuracy
 from tofclip.lidar.photons.scene import learn_background
-from tofclip.lidar.photons.surface import (
-    Smoothness,
-    estimate_surface,
-    locate_with_smoothness,
-)
+from tofclip.lidar.photons.surface import estimate_surface
 
 __all__ = [
     "Accuracy",
@@ -29,14 +25,11 @@ __all__ = [
     "PhotonCube",
     "PhotonDetector",
     "PhotonImage",
-    "Smoothness",
     "SurfaceImage",
     "compute_range_bound",
     "correct_pile_up",
     "estimate_pixels",
     "estimate_surface",
     "learn_background",
-    "locate_with_smoothness",
-    "make_pinhole",
     "measure_accuracy",
 ]

@@ -603,6 +603,3 @@ class SurfaceImage:
             provenance={} if provenance is None else provenance,
             false_alarm=doubt[chosen],
         )
-
-
-make_pinhole = Camera.pinhole  # its name until version 0.2

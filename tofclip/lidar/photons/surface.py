@@ -6,7 +6,6 @@
 
 How much neighbours have to agree, how far they reach, the response and the probability of an
 outlier come from the data: a part of the photons is held back, and what explains it best counts.
-`locate_with_smoothness` is the same search with a detector's pulse and given costs.
 """
 
 from __future__ import annotations
@@ -14,20 +13,18 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
 
 from tofclip.arrays import BoolArray, Float32Array, FloatArray
-from tofclip.errors import InputError, ShapeError
-from tofclip.lidar.photons.detector import Arrivals, PhotonDetector
+from tofclip.errors import InputError
+from tofclip.lidar.photons.detector import PhotonDetector
 from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, find_dim_pixels
 from tofclip.lidar.photons.matching import (
     PLANE_ROUNDS,
     TRIAL_ROUNDS,
-    LabelAxis,
     choose_label_axis,
     compute_scores,
     estimate_bias,
@@ -474,75 +471,3 @@ def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> F
         pooled, 9 * expected, MAX_POOLED_CHANCE
     )
     return np.where(kept[..., np.newaxis], layer, np.nan)
-
-
-@dataclass(frozen=True)
-class Smoothness:
-    """How much neighbouring pixels have to agree.
-
-    Parameters
-    ----------
-    slope_cost : float
-        Log-likelihood that a change by one bin from pixel to pixel has to bring.
-    jump_cost : float
-        Log-likelihood that any larger change has to bring: borders of objects stay sharp.
-    reach_px : int
-        Photons of neighbours up to so far away are pooled, if they lie on the same surface.
-
-    Raises
-    ------
-    InputError
-        Costs that are negative or a jump that is cheaper than a slope; a negative reach.
-    """
-
-    slope_cost: float = 1.0
-    jump_cost: float = 6.0
-    reach_px: int = 1
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.slope_cost <= self.jump_cost < np.inf or self.reach_px < 0:
-            raise InputError(
-                "slope and jump cost must not be negative, the jump not cheaper, the reach not negative"
-            )
-
-
-def locate_with_smoothness(
-    detector: PhotonDetector, counts: ArrayLike, smoothness: Smoothness | None = None
-) -> Arrivals:
-    """Find one return for every pixel of a picture, with the help of its neighbours.
-
-    The search of `estimate_surface`, with the detector's pulse, over all bins and at given costs: the
-    most likely piecewise smooth surface, then planes through neighbours on the same one. The
-    background is taken as even. Every pixel gets a return: `confidence`, the Cramer-Rao bound of the
-    pooled photons, says what it is worth. Neighbours share photons, so their errors are alike.
-
-    Parameters
-    ----------
-    detector : PhotonDetector
-    counts : (rows, columns, bins) array
-        Photons counted.
-    smoothness : Smoothness, optional
-
-    Returns
-    -------
-    Arrivals
-        Arrays of (rows * columns, 1), in raster order; photons are those of an average contributor.
-
-    Raises
-    ------
-    ShapeError, InputError
-        No cube, or counts that are negative or not finite, or no photon at all.
-    """
-    chosen = Smoothness() if smoothness is None else smoothness
-    cube = np.asarray(counts, dtype=np.float64)
-    if cube.ndim != 3 or cube.shape[2] != detector.bins:
-        raise ShapeError("counts", f"(rows, columns, {detector.bins})", cube.shape)
-    photons = PhotonImage.from_cube(cube, detector.bin_width)
-    scene = Scene.start(photons, detector.pulse)
-    every = LabelAxis(1, np.arange(detector.bins), detector.bins)
-    volume = compute_scores(photons, scene, every)
-    costs = chosen.slope_cost, chosen.jump_cost
-    surface, _ = match_labels(volume, every, photons.image_shape, *costs)
-    fitted = fit_surface(photons, scene, surface, chosen.reach_px).reshape(-1, 1, 3)
-    bin_m = SPEED_OF_LIGHT / 2 * detector.bin_width
-    return Arrivals(bin_m * fitted[..., 0], fitted[..., 2], bin_m * fitted[..., 1])
