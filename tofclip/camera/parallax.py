@@ -67,13 +67,8 @@ def fit_parallax_to_shears(
     shears: ArrayLike, distances: ArrayLike, weight: ArrayLike | None = None
 ) -> Parallax:
     """Fit s(d) to `shears` (n,), pixels per view step, of surfaces at known `distances` (n,), m,
-    each with a `weight` (n,), all alike by default.
-
-    Raises
-    ------
-    CalibrationError
-        Fewer than two different distances, or shears that change with distance by no more than
-        their errors.
+    each with a `weight` (n,), all alike by default. `CalibrationError` for fewer than two different
+    distances, or shears that change with distance by no more than their errors.
     """
     s, d = np.asarray(shears, dtype=np.float64), np.asarray(distances, dtype=np.float64)
     w = np.ones(s.shape) if weight is None else np.asarray(weight, dtype=np.float64)

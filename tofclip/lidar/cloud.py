@@ -166,51 +166,31 @@ class PointCloud(Storable):
         return render_html("PointCloud", rows, light)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the points as the camera sees them, coloured by range.
-
-        Parameters
-        ----------
-        ax : matplotlib Axes, optional
-            Where to draw; by default the current figure's.
-
-        Returns
-        -------
-        matplotlib Axes
+        """Draw the points as the camera sees them, coloured by range, into matplotlib Axes `ax`, by
+        default the current figure's; return them.
         """
         ax = plot_points(self.xyz, self.range, ax)
         ax.set_title(f"{len(self)} points")
         return ax
 
     def to_pandas(self) -> Any:
-        """Return a `pandas.DataFrame` with a row for each point, columns as in `COLUMN_UNITS`.
-
-        Raises
-        ------
-        MissingDependencyError
-            pandas is not installed.
+        """Return a `pandas.DataFrame` with a row for each point, columns as in `COLUMN_UNITS`;
+        `MissingDependencyError` where pandas is not installed.
         """
         columns = {column.name: column.values for column in self.columns}
         return require_package("pandas").DataFrame(columns)
 
     def to_open3d(self) -> Any:
         """Return an `open3d.geometry.PointCloud`: the positions, and the intensity as colours; see
-        `to_open3d_tensor` for one with all columns.
-
-        Raises
-        ------
-        MissingDependencyError
-            Open3D is not installed, or does not load here.
+        `to_open3d_tensor` for one with all columns. `MissingDependencyError` where Open3D is not
+        installed, or does not load.
         """
         return self.to_open3d_tensor().to_legacy()
 
     def to_open3d_tensor(self) -> Any:
         """Return an `open3d.t.geometry.PointCloud`: positions, the intensity as colours, and every
-        other column as an attribute (points, 1), such as ``.point["range_sigma"]``.
-
-        Raises
-        ------
-        MissingDependencyError
-            Open3D is not installed, or does not load here.
+        other column as an attribute (points, 1), such as ``.point["range_sigma"]``;
+        `MissingDependencyError` as `to_open3d`.
         """
         tensors = import_open3d()
         shown = tensors.t.geometry.PointCloud(tensors.core.Tensor(self.xyz))
@@ -222,19 +202,10 @@ class PointCloud(Storable):
 
     @classmethod
     def from_open3d(cls, cloud: Any) -> PointCloud:
-        """Make a point cloud of one of Open3D's, legacy or tensor.
-
-        Parameters
-        ----------
-        cloud : open3d.geometry.PointCloud or open3d.t.geometry.PointCloud
-            Positions in m, x right, y down, z forward. Attributes named as in `COLUMN_UNITS` are
-            taken over. What is missing is made up where it follows from the positions (range and
-            time, first returns), is otherwise NaN; intensity is then the mean of the colours.
-
-        Raises
-        ------
-        InputError
-            It is not a point cloud of Open3D.
+        """Make a point cloud of one of Open3D's, legacy or tensor, positions in m, x right, y down, z
+        forward. Attributes named as in `COLUMN_UNITS` are taken over. What is missing is made up
+        where it follows from the positions (range and time, first returns), is otherwise NaN;
+        intensity is then the mean of the colours. `InputError` where `cloud` is none of Open3D's.
         """
         open3d = import_open3d()
         if isinstance(cloud, open3d.geometry.PointCloud):
@@ -247,12 +218,8 @@ class PointCloud(Storable):
         return complete_cloud(xyz, known)
 
     def to_torch(self) -> Any:
-        """Return the positions as a PyTorch tensor (points, 3), m, which shares NumPy's memory.
-
-        Raises
-        ------
-        MissingDependencyError
-            PyTorch is not installed.
+        """Return the positions as a PyTorch tensor (points, 3), m, which shares NumPy's memory;
+        `MissingDependencyError` where PyTorch is not installed.
         """
         return require_package("torch").as_tensor(self.xyz)
 
@@ -282,13 +249,8 @@ class PointCloud(Storable):
     @classmethod
     def load(cls, path: str | Path) -> PointCloud:
         """Read a point cloud that `save` wrote, in any of its formats; of an organised one the points
-        that are there.
-
-        Raises
-        ------
-        InputError, StorageError, FileFormatError
-            A suffix of no known format, a file that cannot be read, or one that is damaged or lacks
-            a column.
+        that are there. `InputError`, `StorageError` or `FileFormatError` for a suffix of no known
+        format, a file that cannot be read, or one that is damaged or lacks a column.
         """
         if Path(path).suffix.lower() == ".h5":
             return super().load(path)

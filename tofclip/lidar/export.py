@@ -64,15 +64,8 @@ E57_NAMES = {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ", "intensity
 
 @dataclass(frozen=True)
 class Column:
-    """One property of all points, as files hold it.
-
-    Parameters
-    ----------
-    name : str
-    unit : str
-        SI unit, or empty for a pure number.
-    values : (n,) array
-        float32, float64 or uint8.
+    """One property of all points, as files hold it, by its `name`: `values` (n,), float32, float64 or
+    uint8, in a `unit` of the SI, empty for a pure number.
     """
 
     name: str
@@ -504,17 +497,10 @@ FORMATS: dict[str, tuple[Callable[..., None], Callable[[Path], Entries]]] = {
 
 
 def save_depth(returns: Returns, path: str | Path) -> None:
-    """Write each pixel's most intense return to an OpenEXR file, whole or not at all.
-
-    Channel ``Z`` is the depth along the optical axis in metres, infinite where nothing came back,
-    as renderers have it; ``Y`` the intensity in counts referred to 1 m, 0 there. Both are 32-bit
-    floats.
-
-    Parameters
-    ----------
-    returns : Returns
-    path : path-like
-        Ends in ``.exr``.
+    """Write each pixel's most intense return of `returns` to an OpenEXR file, `path`, whole or not at
+    all. Channel ``Z`` is the depth along the optical axis in metres, infinite where nothing came
+    back, as renderers have it; ``Y`` the intensity in counts referred to 1 m, 0 there. Both are
+    32-bit floats.
     """
     from tofclip.io.light_fields import write_exr_parts
 

@@ -71,24 +71,9 @@ class Pulse:
     @classmethod
     def exponentially_modified(cls, fwhm: float, decay: float) -> Pulse:
         """Return a Gaussian convolved with an exponential decay, as photon-counting diodes answer a
-        short pulse.
-
-        Parameters
-        ----------
-        fwhm : float
-            Full width at half maximum of the Gaussian, s. Its middle, before the decay, is the
-            arrival.
-        decay : float
-            Time constant of the exponential, s.
-
-        Returns
-        -------
-        Pulse
-
-        Raises
-        ------
-        InputError
-            A width or decay that is not a positive time, or a decay that is thousands of widths.
+        short pulse: of full width at half maximum `fwhm`, s, its middle, before the decay, being the
+        arrival, and a time constant `decay`, s. `InputError` where these are no positive times, or
+        the decay is thousands of widths.
         """
         from scipy.stats import exponnorm
 
@@ -106,14 +91,9 @@ class Pulse:
 
     def integrate_bins(self, bin_width: float) -> Pulse:
         """Return the shape that bins of `bin_width`, s, show: its light summed from half a bin
-        before to half after.
-
-        Sampled at the middles of bins it is, up to one factor, each bin's fraction of the light.
-
-        Raises
-        ------
-        InputError
-            A width that is not positive, or so far from the pulse's that one of the units is wrong.
+        before to half after. Sampled at the middles of bins it is, up to one factor, each bin's
+        fraction of the light. `InputError` where the width is not positive, or so far from the
+        pulse's that one of the units is wrong.
         """
         require_positive("the width of a bin", bin_width, "time")
         spacing = min(self.spacing, bin_width / SAMPLES_PER_BIN)

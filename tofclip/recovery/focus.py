@@ -60,21 +60,9 @@ class Focus:
         measurement: Measurement | None = None,
         progress: Progress = ignore_progress,
     ) -> list[FrameSegment]:
-        """Cut the frames at `times` (s of flight) into pieces, in order and without gaps.
-
-        Parameters
-        ----------
-        camera : Camera
-        times : (frames,) float array
-            Times of flight, s.
-        measurement : Measurement, optional
-            Of the same frames; `SharpestFocus` needs it.
-        progress : callable
-            Called with the number of frame iterations just done, `work` of them.
-
-        Returns
-        -------
-        list of FrameSegment
+        """Cut the frames of a `camera` at `times` (frames,), s of flight, into pieces, in order and
+        without gaps. `measurement`: of the same frames, which `SharpestFocus` needs; `progress` is
+        called with the number of frame iterations just done, `work` of them.
         """
         raise NotImplementedError
 

@@ -106,14 +106,8 @@ def list_files(
 
     A file's name is its path from the folder that they have in common, without the ending. Paths
     are absolute: a cluster's workers run in other folders. Hidden files are left out, and the settings
-    that a run leaves beside its results.
-
-    Raises
-    ------
-    InputError
-        There is no file, or two have the same name.
-    StorageError
-        There is no such folder.
+    that a run leaves beside its results. `InputError` where there is no file, or two have the same
+    name, `StorageError` where there is no such folder.
     """
     folder = Path(source)
     if folder.is_dir():

@@ -220,25 +220,14 @@ def _shield_children_from_interrupt() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Job:
-    """Something to be done once.
+    """Something to be done once."""
 
-    Parameters
-    ----------
-    name : str
-        What a message calls it.
-    result : Path
-        The file it makes, whole or not at all; on a cluster, where every worker can write it.
-    work : callable
-        Makes the file; may return a few figures about it. It has to survive pickling: a
-        `functools.partial` of a function of a module with names of files and numbers.
-    extra_outputs : tuple of Path
-        Further files that it writes, before the result.
-    """
-
-    name: str
-    result: Path
+    name: str  # what a message calls it
+    result: Path  # the file it makes, whole or not at all, where every worker can write it
+    # Makes the file; may return a few figures about it. It has to survive pickling: a
+    # `functools.partial` of a function of a module with names of files and numbers.
     work: Callable[[], Any]
-    extra_outputs: tuple[Path, ...] = ()
+    extra_outputs: tuple[Path, ...] = ()  # further files that it writes, before the result
 
 
 @dataclass(frozen=True)

@@ -113,14 +113,8 @@ class RangingSettings:
 
 
 def name_cloud(shots: Sequence[str]) -> str:
-    """Return the name of the cloud of some shots: theirs, or the first one's and the last one's.
-
-    `shots`: at least one; of a shot in a folder inside the sequence's, the path with the folder.
-
-    Examples
-    --------
-    >>> name_cloud(["run2/shot_07"]), name_cloud(["a_03", "a_04", "a_05"])
-    ('run2_shot_07', 'a_03-a_05')
+    """Return the name of the cloud of some shots, at least one: ``run2_shot_07`` of ``run2/shot_07``,
+    ``a_03-a_05`` of all from ``a_03`` to ``a_05``.
     """
     ends = shots[:1] if len(shots) == 1 else (shots[0], shots[-1])
     return "-".join(name.replace("/", "_") for name in ends)

@@ -291,18 +291,9 @@ class PhotonDetector:
         return float(np.interp(photons, nodes, known))
 
     def adapt(self, histograms: FloatArray) -> PhotonDetector:
-        """Return a detector for the background that these histograms have in common.
-
-        Parameters
-        ----------
-        histograms : (n, bins) array
-            Photons counted in each bin.
-
-        Returns
-        -------
-        PhotonDetector
-            This one where its background is given already, or where the histograms are too few
-            to tell it from an even one; see `tofclip.lidar.photons.scene`.
+        """Return a detector for the background that these `histograms` (n, bins) have in common; this
+        one where its background is given already, or where they are too few to tell it from an even
+        one; see `tofclip.lidar.photons.scene`.
         """
         if self.background is not None:
             return self

@@ -120,19 +120,9 @@ class PhotonImage:
 
     @classmethod
     def from_cube(cls, counts: ArrayLike, bin_width: float) -> PhotonImage:
-        """Turn a histogram for each pixel into events.
-
-        Parameters
-        ----------
-        counts : (rows, columns, bins) array
-            Photons counted in each bin.
-        bin_width : float
-            Duration of a bin, s.
-
-        Raises
-        ------
-        ShapeError, InputError
-            Not a cube, or counts that are negative or not finite.
+        """Turn a histogram for each pixel into events: `counts` (rows, columns, bins) of photons in
+        bins of `bin_width`, s. `ShapeError` or `InputError` where it is no cube, or counts are
+        negative or not finite.
         """
         cube = np.asarray(counts)
         if cube.ndim != 3:
@@ -154,25 +144,10 @@ class PhotonImage:
         bin_width: float,
         bins: int | None = None,
     ) -> PhotonImage:
-        """Sort single photons by pixel.
-
-        Parameters
-        ----------
-        pixel : (photons,) int array
-            Raster number of the pixel that counted each photon.
-        bin_number : (photons,) array
-            Its time in bins, 0 for the middle of the first bin.
-        image_shape : (int, int)
-            Rows and columns.
-        bin_width : float
-            Duration of a bin, s.
-        bins : int, optional
-            Bins of the time axis; by default up to the latest photon.
-
-        Raises
-        ------
-        InputError
-            No photon, or a time that is negative or not finite.
+        """Sort single photons by pixel: `pixel` (photons,) is the raster number of the one that counted
+        each, in a picture of `image_shape`, and `bin_number` (photons,) its time in bins of
+        `bin_width`, s, 0 for the middle of the first one; there are `bins`, by default up to the
+        latest photon. `InputError` for no photon, or a time that is negative or not finite.
         """
         when = np.asarray(bin_number, dtype=np.float32)
         if not np.all(np.isfinite(when)) or when.min(initial=0) < 0:
@@ -545,18 +520,9 @@ class SurfaceImage:
         return replace(first, further=tuple(further), hot_pixels=hot)
 
     def calibrate(self, camera: Camera, first_time: float = 0.0) -> SurfaceImage:
-        """Return the ranges from the camera's time zero, with its range calibration applied.
-
-        Parameters
-        ----------
-        camera : Camera
-        first_time : float
-            Reading of the time axis at the middle of the first bin, s.
-
-        Raises
-        ------
-        CalibrationError
-            The camera has another number of pixels.
+        """Return the ranges from the time zero of `camera`, with its range calibration applied, where
+        the time axis reads `first_time`, s, at the middle of the first bin. `CalibrationError` where
+        the camera has another number of pixels.
         """
         if camera.image_shape != self.range.shape:
             raise CalibrationError(
@@ -573,14 +539,8 @@ class SurfaceImage:
         return replace(self, range=distance, range_sigma=sigma, further=further)
 
     def to_returns(self, camera: Camera, provenance: Mapping[str, Any] | None = None) -> Returns:
-        """List the pixels with a range.
-
-        Parameters
-        ----------
-        camera : Camera
-            Says where the pixels look, see `Camera.pinhole`.
-        provenance : mapping, optional
-            How they came about.
+        """List the pixels with a range: `camera` says where they look, see `Camera.pinhole`, and
+        `provenance` how they came about.
         """
         layers = [self, *self.further]
         distance, sigma, signal, doubt = (

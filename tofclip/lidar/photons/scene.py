@@ -430,20 +430,9 @@ MIN_UNEVENNESS = 0.1  # backgrounds that differ by less, or less than their nois
 
 
 def learn_background(histograms: FloatArray, width: float) -> FloatArray | None:
-    """Estimate the background's shape.
-
-    Parameters
-    ----------
-    histograms : (n, bins) array
-        Photons.
-    width : float
-        Full width at half maximum of the pulse, bins.
-
-    Returns
-    -------
-    (bins,) float64 array or None
-        Relative to its mean. None where it is even as far as these histograms say, or where they
-        are too few to say anything.
+    """Estimate the background's shape, (bins,) relative to its mean, from `histograms` (n, bins) of
+    photons, of pulses of full width at half maximum `width`, bins. None where it is even as far as
+    these say, or where they are too few to say anything.
     """
     total = histograms.sum(axis=0)
     number, bins = histograms.shape
