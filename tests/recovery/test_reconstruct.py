@@ -21,7 +21,6 @@ from tofclip.recovery import (
     open_shot,
     plan_recovery,
 )
-from tofclip.recovery import shot as opening
 from tofclip.simulate import (
     make_default_instrument,
     make_default_scene,
@@ -291,26 +290,6 @@ def test_the_time_zero_given_comes_before_the_cameras(streak):
     frames = plan_recovery(shot, LinearInverse()).run()
     np.testing.assert_allclose(frames.times, shot.times)
     assert frames.camera.time_zero == shot.camera.time_zero == -2e-9
-
-
-def test_the_error_of_slit_centres_is_told_though_a_part_of_it_shows_in_no_shot(monkeypatch):
-    """A displaced picture looks like displaced centres: of the errors of seven views a shot shows
-    what is no displacement, and from that the error of each is known without bias.
-    """
-    centres = 40.0 + 60 * np.arange(7)
-    angles = np.arctan([0.7, -0.4, 0.1, 0.9, -0.8, -0.1, 0.4])
-    nominal = Camera(centres, angles, (16, 16), 440, time_zero=1e-9)
-    looks = np.stack([np.ones(7), -np.tan(angles)], axis=1)
-    random, squares = np.random.default_rng(0), []
-    shot = open_shot(Streak(np.ones((12, 440), np.float32), np.arange(12) * 20e-12), nominal)
-    for _ in range(2000):
-        error = random.normal(0, 0.5, 7)
-        shown = error - looks @ np.linalg.lstsq(looks, error)[0]
-        found = nominal.replace(centres_px=centres + shown)
-        monkeypatch.setattr(opening, "fit_camera_to_shot", lambda *_, found=found: found)
-        squares.append(shot.fit_camera().centre_error_px ** 2)
-    # 10,000 degrees of freedom know a variance to 1.4 %
-    assert np.mean(squares) == pytest.approx(0.5**2, rel=0.05)
 
 
 def test_what_is_missing_or_unknown_is_said_before_anything_runs(streak):

@@ -210,9 +210,7 @@ class RecoveryPlan:
             coarse = shot.merge_rows(count_needless_rows(shot))
             start = self._recover_frames(coarse, method.start, focus, progress)
             try:
-                found = method.recover_surfaces(
-                    coarse.streak, start, progress, shot.centre_error_px
-                )
+                found = method.recover_surfaces(coarse.streak, start, progress, shot.calibrated_px)
             except InputError as fault:
                 if method.otherwise is None:
                     raise

@@ -34,14 +34,13 @@ class Shot:
         With a time axis.
     camera : Camera
         With the time zero that holds for this shot. Its sweep may be unknown; see `fit_camera`.
-    centre_error_px : float
-        How far off the calibration had each slit centre, as far as the shot shows it; 0 where the
-        camera was not fitted to it.
+    calibrated_px : (views,) array, optional
+        Slit centres as they were calibrated, where the camera was fitted to the shot since.
     """
 
     streak: Streak
     camera: Camera
-    centre_error_px: float = 0.0
+    calibrated_px: FloatArray | None = None
 
     @property
     def times(self) -> FloatArray:
@@ -75,11 +74,7 @@ class Shot:
         if self.camera.sweep is not None:
             return self
         found = fit_camera_to_shot(self.streak, self.camera, progress, max_rounds)
-        moved_px = found.centres_px - self.camera.centres_px
-        # two combinations of the centres only displace the picture, which no shot shows
-        freedom = max(found.views - 2, 1)
-        error_px = float(np.sqrt(np.sum(moved_px**2) / freedom))
-        return replace(self, camera=found, centre_error_px=error_px)
+        return replace(self, camera=found, calibrated_px=self.camera.centres_px)
 
 
 def count_needless_rows(shot: Shot) -> int:

@@ -165,8 +165,8 @@ class SurfacePipeline:
 
     def search(self, found: SurfaceFit) -> Returns:
         """List the returns of what `recover_shot` returned."""
-        error_px = self._opened.centre_error_px
-        returns = keep_probable(list_returns(found, self.method.detection, error_px))
+        calibrated_px = self._opened.calibrated_px
+        returns = keep_probable(list_returns(found, self.method.detection, calibrated_px))
         # a sweep is that of the shot's own rows
         return replace(returns, camera=returns.camera.replace(sweep=self.camera.sweep))
 

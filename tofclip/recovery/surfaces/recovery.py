@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy
 
+from tofclip.arrays import FloatArray
 from tofclip.camera import measure
 from tofclip.errors import InputError
 from tofclip.lidar import Detection
@@ -80,7 +81,7 @@ class SurfaceRecovery:
         streak: Streak,
         frames: Frames,
         progress: Progress = ignore_progress,
-        centre_error_px: float = 0.0,
+        calibrated_px: FloatArray | None = None,
     ) -> Frames:
         """Recover the surfaces of a shot.
 
@@ -91,8 +92,8 @@ class SurfaceRecovery:
             A fast recovery of the same shot, with the camera to use.
         progress : callable
             Called with the number of frame iterations just done.
-        centre_error_px : float
-            How far off the calibration had each slit centre, as for `tofclip.recovery.Shot`.
+        calibrated_px : (views,) array, optional
+            Slit centres as they were calibrated, if the camera's are others.
 
         Returns
         -------
@@ -105,7 +106,7 @@ class SurfaceRecovery:
             Most of the light does not come from surfaces, or none stands out of the noise.
         """
         fit = fit_surfaces(streak, frames, self.weight, self.iterations, progress)
-        returns = list_returns(fit, self.detection, centre_error_px)
+        returns = list_returns(fit, self.detection, calibrated_px)
         if not np.any(returns.false_alarm <= DEFAULT_FALSE_ALARM):
             raise call_dark(estimate_darkness(streak, frames))
         model, amplitude, camera = fit.whole.model, fit.whole.amplitude, returns.camera

@@ -53,11 +53,13 @@ PART_PX = 1 / np.sqrt(12)
 
 
 @limit_blas_threads()
-def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float = 0.0) -> Returns:
+def list_returns(
+    fit: SurfaceFit, detection: Detection, calibrated_px: FloatArray | None = None
+) -> Returns:
     """List the points of surfaces that stand out of the noise, and beside them the frames' returns where
     no surface is, pixel by pixel.
 
-    `centre_error_px`: how far off the calibration had each slit centre, see `tofclip.recovery.Shot`.
+    `calibrated_px`: slit centres as they were calibrated, (views,), if the fit's camera has others.
     """
     model, amplitude = fit.solver.model, fit.solver.amplitude
     centres = model.camera.centres_px + model.state.centres
@@ -74,7 +76,8 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
     chosen = bright[strong]
 
     fitted = model.estimate_deviation(fit.refinement.covariances)
-    moved = estimate_displacement(camera, centre_error_px)[:, np.newaxis] * model.compute_slopes()
+    begun_px = model.camera.centres_px if calibrated_px is None else calibrated_px
+    moved = estimate_displacement(camera, begun_px)[:, np.newaxis] * model.compute_slopes()
     rest = model.image - fit.whole.model.render(fit.whole.amplitude)
     bent = measure_local_shifts(model, amplitude, rest) / SHIFT_SHOWN
     y, x = model.row[chosen], model.column[chosen]
@@ -192,13 +195,14 @@ def _add_up_near(model: SurfaceModel, amplitudes: Image) -> FloatArray:
     return np.asarray(total[:, last] - total[:, first])
 
 
-def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
-    """Return how far errors of the slit centres displace the picture to the right and down, px.
+def estimate_displacement(camera: Camera, calibrated_px: FloatArray) -> FloatArray:
+    """Return how far errors of calibrated slit centres, (views,), displace the picture to the right and
+    down, px; `camera`: with those that a shot shows.
 
     Of errors e_v a shot shows all but what looks like a displaced picture, ``e_v = dx - dy
-    tan(angle_v)``. That part is taken to be that of errors which alternate, as of neighbouring
-    lenslets measured in turns; independent ones would leave sqrt(views) as much.
+    tan(angle_v)``. They are taken to be independent: what is shown says how large they are.
     """
-    in_turns = (-1.0) ** np.arange(camera.views)
     looks = np.stack([np.ones(camera.views), -np.tan(camera.angles)], axis=1)
-    return np.asarray(np.abs(np.linalg.pinv(looks) @ in_turns) * centre_error_px)
+    freedom = max(camera.views - looks.shape[1], 1)
+    error_px = np.linalg.norm(camera.centres_px - calibrated_px) / np.sqrt(freedom)
+    return np.asarray(error_px * np.linalg.norm(np.linalg.pinv(looks), axis=1))
