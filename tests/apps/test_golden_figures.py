@@ -56,8 +56,9 @@ def test_the_demonstration(demonstration, demo_folder):
     assert found["image_nmse"] < 0.045
     assert found["image_nmse_inner"] < 0.065
     assert found["relative_residual"] < 0.06  # the photons' own noise leaves 0.03
-    # 1 if the stated deviations are true, less as they hold what no simulation has: this seed 0.61.
-    assert 0.4 < found["range_z"] < 1.25
+    # 1 if the stated deviations are true, less here: the centres' errors alternate, which displaces the
+    # picture a third as far as independent ones of their size.
+    assert 0.2 < found["range_z"] < 1.25
     written = {"streak.h5", "frames.h5", "cloud.ply", "preview.png"}
     assert {path.name for path in demo_folder.iterdir()} == written
     assert found["points"] == len(PointCloud.load(demo_folder / "cloud.ply"))

@@ -269,6 +269,15 @@ def test_traces_of_particles_and_a_dead_stripe_have_little_effect(clean, ranges)
     check_ranges(dead, ranges, 0.08, 0.03)
 
 
+def test_what_columns_have_at_all_times_has_no_effect(clean, ranges):
+    """Ambient light, of which each column has its own amount, and a column that counts by itself."""
+    columns = np.arange(clean.counts.shape[1])
+    ambient = 60 + 40 * np.sin(columns / 40) + 800 * (columns == 400)
+    counts = np.random.default_rng(0).poisson(ambient, clean.counts.shape)
+    # unlevelled 0.07 are false
+    check_ranges(replace(clean, counts=clean.counts + np.float32(counts)), ranges, 0.006, 0.02)
+
+
 def test_light_is_no_defect(clean):
     """A point that lasts as long as the pulse, and single photons."""
     pulse = np.exp2(-((2 * (np.arange(clean.counts.shape[0]) - 150.3) / PULSE_ROWS) ** 2))

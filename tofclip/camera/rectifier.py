@@ -88,14 +88,23 @@ def estimate_dark_level(counts: Float32Array, row_sums: Float32Array | None = No
     Taken from whole rows, before or after the light came, so that it stays where the
     measurements scatter about it: the least value of a picture would turn noise into an offset.
     """
+    quiet, _ = part_quiet_rows(counts, row_sums)
+    # the median, which NumPy looks for ten times as long as it sorts
+    ordered = np.sort(counts[quiet], axis=None)
+    return float((ordered[(ordered.size - 1) // 2] + ordered[ordered.size // 2]) / 2)
+
+
+def part_quiet_rows(
+    counts: Float32Array, row_sums: Float32Array | None = None
+) -> tuple[IndexArray, IndexArray]:
+    """Return the numbers of the quietest rows, and of all others; arguments as for `estimate_dark_level`."""
     if row_sums is None:
         # a product, which reads the picture at the rate of memory: NumPy's sum takes thrice as long
         row_sums = counts @ np.ones(counts.shape[1], np.float32)
     # Rows, not pixels: choosing the darkest pixels would choose those whose noise is low.
-    quiet = np.argsort(row_sums)[: max(1, round(DARK_ROW_FRACTION * row_sums.size))]
-    # the median, which NumPy looks for ten times as long as it sorts
-    ordered = np.sort(counts[quiet], axis=None)
-    return float((ordered[(ordered.size - 1) // 2] + ordered[ordered.size // 2]) / 2)
+    order = np.argsort(row_sums)
+    number = max(1, round(DARK_ROW_FRACTION * row_sums.size))
+    return order[:number], order[number:]
 
 
 class Rectifier:

@@ -1,5 +1,6 @@
 """Defective measurements of a streak image: pixels that are hot or struck by a particle, columns
-that are dead, light that is cut off at the sensor's limit; and how the others fluctuate.
+that are dead or have a dark level of their own, light that is cut off at the sensor's limit; and how the
+others fluctuate.
 
 Light of a scene comes in pulses, and no sum of pulses is sharper in time than the instrument's
 response: the logarithm of a Gaussian of full width w (rows) has the second difference
@@ -19,6 +20,7 @@ import scipy
 from tofclip.arrays import BoolArray, Float32Array
 from tofclip.camera import Measurement, estimate_dark_level
 from tofclip.camera.noise import MeasurementNoise, find_dazzle_limit
+from tofclip.camera.rectifier import part_quiet_rows
 from tofclip.shots import Streak
 from tofclip.solvers import ClippedSquares, DataTermMaker, LeastSquares
 from tofclip.storage import Scalar
@@ -49,6 +51,8 @@ MAX_CONSTANT_FRACTION = 0.1  # of columns: where more never change, no noise tel
 # lower values, to be a plateau: brightness falls off towards the highest otherwise.
 MIN_CLIPPED_PIXELS, MIN_CLIPPED_RATIO, COMPARED_VALUES = 20, 3.0, 3
 MAX_ROUNDS = 40  # rows of a track that are taken off from either end
+# Of a column's readings, at least as many are dark; and how often those near their mean are chosen anew.
+LEVEL_QUANTILE, LEVEL_ROUNDS = 0.25, 5
 CLIPPED_FRACTION = 0.9  # of the limit above the dark: rectifying mixes light with its neighbours
 MIN_NOISE_COUNT = 0.3  # a dark image whose readings are whole counts still hides this much
 
@@ -173,15 +177,44 @@ def find_dead_columns(counts: Float32Array, noise: float) -> BoolArray:
     return dead if dead.mean() <= MAX_CONSTANT_FRACTION else np.zeros(dead.shape, bool)
 
 
+def level_columns(streak: Streak) -> Streak:
+    """Return a streak image without what its columns have at all times more or less than the usual one, as
+    of ambient light or a dark level of their own; the same where that is nothing.
+
+    That is by how much the dark readings of columns differ in all other rows, as far as they do so in the
+    quietest rows as well: light that comes and goes does not.
+    """
+    counts = streak.counts.astype(np.float32)
+    dark, noise, gain = estimate_noise(counts)
+    quiet, others = part_quiet_rows(counts)
+    rest = counts[others]
+    level = np.quantile(rest, LEVEL_QUANTILE, axis=0) if len(rest) else np.full(rest.shape[1], dark)
+    for _ in range(LEVEL_ROUNDS):
+        own = rest <= level + 2 * np.sqrt(noise**2 + gain * np.maximum(level - dark, 0))
+        level = np.sum(rest, axis=0, where=own) / np.maximum(np.count_nonzero(own, axis=0), 1)
+    level -= np.median(level)
+    seen = counts[quiet].mean(axis=0)
+    seen = seen - np.median(seen)
+    energy = float(level @ level)
+    share = float(level @ seen) / energy if energy else 0.0
+    # what quiet rows leave of it is their noise
+    if not share * np.sqrt(energy) > MIN_SIGNIFICANCE * np.std(seen - share * level):
+        return streak
+    # what is cut off stays as bright as all that is
+    cut_off = counts >= find_clipping_level(counts)
+    counts = np.where(cut_off, counts, counts - np.float32(share) * level)
+    return replace(streak, counts=counts.astype(np.float32))
+
+
 def mask_defects(streak: Streak, pulse_fwhm: float) -> Streak:
-    """Return a streak image whose defects are masked as ``saturated``, and mended for methods that
-    know no mask; ``metadata`` says how many there are. The same where nothing is wrong with it.
-    `pulse_fwhm`: full width at half maximum of the instrument's response, s.
+    """Return a streak image whose columns are level and whose defects are masked as ``saturated``, and
+    mended for methods that know no mask; ``metadata`` says how many there are. The same where nothing is
+    wrong with it. `pulse_fwhm`: full width at half maximum of the instrument's response, s.
     """
     rows = streak.counts.shape[0]
     if rows < 2:
         return streak
-    times = streak.times
+    streak, times = level_columns(streak), streak.times
     defects = find_defects(streak, pulse_fwhm * (rows - 1) / float(times[-1] - times[0]))
     if not defects.count:
         return streak

@@ -103,7 +103,8 @@ def open_shot(
 ) -> Shot:
     """Read a shot and settle which camera and which time zero belong to it.
 
-    Hot pixels, traces of particles and dead columns are masked (`tofclip.recovery.defects`).
+    Hot pixels, traces of particles and dead columns are masked, and what columns have at all times, as of
+    ambient light, is taken off (`tofclip.recovery.defects`).
 
     Parameters
     ----------
