@@ -36,7 +36,7 @@ from tofclip.recovery.defects import (
     mask_defects,
 )
 from tofclip.recovery.plan import recover_measurement
-from tofclip.sequences.cache import get_cached_camera
+from tofclip.sequences.ranger import get_cached_camera
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import DataTermMaker, LeastSquares, LinearInverse, Method
 from tofclip.storage import Record

@@ -120,9 +120,7 @@ def test_pieces_cover_all_frames_within_the_tolerance(shot):
     made = shot.camera
     times = shot.streak.times - made.time_zero
     for tolerance in (0.1, 0.5):
-        pieces = DepthLockedFocus(tolerance).plan_segments(
-            made, times, measure(shot.streak.counts, None, made)
-        )
+        pieces = DepthLockedFocus(tolerance).plan_segments(made, times)
         assert pieces[0].frames.start == 0
         assert pieces[-1].frames.stop == times.size
         assert all(a.frames.stop == b.frames.start for a, b in pairwise(pieces))

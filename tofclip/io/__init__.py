@@ -2,6 +2,6 @@
 with.
 """
 
-from tofclip.io.streaks import StreakStack, read_streak, save_stack
+import lazy_loader as lazy
 
-__all__ = ["StreakStack", "read_streak", "save_stack"]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

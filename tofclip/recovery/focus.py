@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
+from typing import Any
 
 import numpy as np
 
@@ -57,12 +58,13 @@ class Focus:
         self,
         camera: Camera,
         times: FloatArray,
+        *,
         measurement: Measurement | None = None,
         progress: Progress = ignore_progress,
     ) -> list[FrameSegment]:
         """Cut the frames of a `camera` at `times` (frames,), s of flight, into pieces, in order and
-        without gaps. `measurement`: of the same frames, which `SharpestFocus` needs; `progress` is
-        called with the number of frame iterations just done, `work` of them.
+        without gaps. `measurement`: of the same frames, which `SharpestFocus` needs and others do
+        not; `progress` is called with the number of frame iterations just done, `work` of them.
         """
         raise NotImplementedError
 
@@ -86,13 +88,7 @@ class FixedFocus(Focus):
     def __str__(self) -> str:
         return f"fixed:{self.shear:g}"
 
-    def plan_segments(
-        self,
-        camera: Camera,
-        times: FloatArray,
-        measurement: Measurement | None = None,
-        progress: Progress = ignore_progress,
-    ) -> list[FrameSegment]:
+    def plan_segments(self, camera: Camera, times: FloatArray, **others: Any) -> list[FrameSegment]:
         """Return a single piece."""
         return [FrameSegment(slice(0, times.size), self.shear)]
 
@@ -120,13 +116,7 @@ class DepthLockedFocus(Focus):
                 "(tofclip.camera.parallax) or choose another `focus`, fixed:S or stack:S0:S1:N"
             )
 
-    def plan_segments(
-        self,
-        camera: Camera,
-        times: FloatArray,
-        measurement: Measurement | None = None,
-        progress: Progress = ignore_progress,
-    ) -> list[FrameSegment]:
+    def plan_segments(self, camera: Camera, times: FloatArray, **others: Any) -> list[FrameSegment]:
         """Cut where the shear has changed by twice the tolerance, or light is a third weaker."""
         distance = np.maximum(SPEED_OF_LIGHT * times / 2, MIN_RANGE_M)
         octave = np.floor(np.log(distance / distance[0]) / np.log(SEGMENT_RANGE_RATIO))
@@ -160,6 +150,7 @@ class SharpestFocus(Focus):
         self,
         camera: Camera,
         times: FloatArray,
+        *,
         measurement: Measurement | None = None,
         progress: Progress = ignore_progress,
     ) -> list[FrameSegment]:

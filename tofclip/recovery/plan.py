@@ -366,7 +366,7 @@ def recover_measurement(
     which their returns are judged where the `noise` of the measurements is known.
     """
     solving = time.perf_counter()
-    segments = focus.plan_segments(camera, times, measurement, progress)
+    segments = focus.plan_segments(camera, times, measurement=measurement, progress=progress)
     dazzled = None if noise is None else find_dazzled(measurement, noise)
     used = measurement.valid if dazzled is None else measurement.valid & ~dazzled
     with device.activate():

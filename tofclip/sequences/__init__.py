@@ -5,23 +5,6 @@ What is done to one of them stands here once; one file, a sequence here and a se
 take the same way.
 """
 
-from tofclip.sequences.inputs import FileShot, Shot, StackShot, is_sequence, list_files, list_shots
-from tofclip.sequences.ranging import RangingPlan, RangingSettings
-from tofclip.sequences.recovering import CloudSettings, RecoverySettings, expand_sweep
-from tofclip.sequences.streaming import CloudPipeline, make_pipeline
+import lazy_loader as lazy
 
-__all__ = [
-    "CloudPipeline",
-    "CloudSettings",
-    "FileShot",
-    "RangingPlan",
-    "RangingSettings",
-    "RecoverySettings",
-    "Shot",
-    "StackShot",
-    "expand_sweep",
-    "is_sequence",
-    "list_files",
-    "list_shots",
-    "make_pipeline",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

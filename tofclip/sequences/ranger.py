@@ -2,19 +2,22 @@
 pictures of a method with a prior, or surfaces, begin at what the last shot showed.
 
 From one shot to the next little changes but the noise. Iterations that begin at the last shot's
-pictures need a few steps where those that begin in darkness need forty.
+pictures need a few steps where those that begin in darkness need forty. Operators and inverted matrices
+of a camera are made once in a process; operators are known by what they project: two shots whose files
+carry the same camera share its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from tofclip.arrays import BoolArray, Float32Array, FloatArray
 from tofclip.camera import Camera, Rectifier
@@ -23,7 +26,7 @@ from tofclip.lidar import PointCloud, point_cloud
 from tofclip.lidar.pulse_tables import PictureTraces, TraceBins, Traces
 from tofclip.lidar.search import ReturnSearch, keep_probable
 from tofclip.lidar.signal_rows import RowBlock, SignalRowFinder
-from tofclip.operators import LinearOperator
+from tofclip.operators import LinearOperator, LineProjection
 from tofclip.recovery import (
     DepthLockedFocus,
     Focus,
@@ -37,10 +40,9 @@ from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.recovery.shot import count_needless_rows
 from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces
 from tofclip.recovery.surfaces.returns import list_returns
-from tofclip.sequences.cache import CachedInverse, get_cached_camera
 from tofclip.sequences.counting import StillSum
 from tofclip.shots import Returns, Streak
-from tofclip.solvers import LinearInverse, ProximalMethod, Sparse
+from tofclip.solvers import LinearInverse, PreparedInverse, ProximalMethod, Sparse
 from tofclip.solvers.direct import InverseTraces, order_by_patch
 
 __all__ = ["RangingPipeline", "SummedShot", "build_cloud_path"]
@@ -52,6 +54,64 @@ WARM_ITERATIONS = 12
 # Of a piece of the streak image that is averaged as far as nothing changes in it: rows in widths of
 # the pulse, and columns. Smaller ones have too few photons to show a change.
 STILL_WIDTHS, STILL_COLUMNS = 2.0, 4
+
+# Frames at more shears than that make the further operators anew. Twice as many operators, so that
+# one whose inverse is kept is kept as well.
+MAX_CACHED_INVERSES, MAX_CACHED_OPERATORS = 16, 32
+
+_inverse_lock = Lock()
+
+
+class _CachedCamera(Camera):
+    """A camera that is equal to others that project alike, with which it shares operators. Memory:
+    for each of the operators 16 bytes for each of ``views * rows * columns * 2`` entries.
+    """
+
+    @cached_property
+    def _projection(self) -> tuple[Any, ...]:
+        lines = self.centres_px, self.angles, self.gains, self.view_positions
+        return self.image_shape, self.slit_width_px, *(one.tobytes() for one in lines)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _CachedCamera) and self._projection == other._projection
+
+    def __hash__(self) -> int:
+        return hash(self._projection)
+
+    def operator(self, shear: float = 0.0, dtype: DTypeLike = np.float32) -> LineProjection:
+        """Return F(d), see `Camera.operator`; the same object for the same arguments."""
+        return _make_operator(self, float(shear), np.dtype(dtype).str)
+
+
+@lru_cache(maxsize=MAX_CACHED_OPERATORS)
+def _make_operator(camera: _CachedCamera, shear: float, dtype: str) -> LineProjection:
+    return Camera.operator(camera, shear, dtype)
+
+
+def get_cached_camera(camera: Camera) -> Camera:
+    """Return the camera with the operators that this process has kept of its content."""
+    return _CachedCamera(**{one.name: getattr(camera, one.name) for one in fields(camera)})
+
+
+@dataclass(frozen=True, repr=False)
+class CachedInverse(LinearInverse):
+    """The linear inverse, whose Gram matrices are inverted once for each operator of a camera that
+    `get_cached_camera` returned; another one is not found again. The 16 used last are kept.
+    """
+
+    def __repr__(self) -> str:
+        return repr(LinearInverse(self.damping))  # results say what was done, not what was kept
+
+    def prepare(self, operator: LinearOperator, alive: BoolArray | None = None) -> PreparedInverse:
+        """Do as `LinearInverse.prepare`; the same object for the same arguments."""
+        known = np.ones(operator.shape_out, bool) if alive is None else alive
+        with _inverse_lock:  # threads that ask at the same time wait for a single preparation
+            return _prepare(self.damping, operator, known.tobytes())
+
+
+@lru_cache(maxsize=MAX_CACHED_INVERSES)
+def _prepare(damping: float, operator: Any, alive: bytes) -> PreparedInverse:
+    return LinearInverse(damping).prepare(operator, np.frombuffer(alive, bool))
 
 
 class WarmStartedRecovery:

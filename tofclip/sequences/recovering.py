@@ -25,9 +25,9 @@ from tofclip.recovery import (
     plan_recovery,
 )
 from tofclip.recovery.plan import DEFAULT_METHOD
-from tofclip.sequences.cache import CachedInverse, get_cached_camera
 from tofclip.sequences.inputs import Shot
 from tofclip.sequences.jobs import Job, list_jobs
+from tofclip.sequences.ranger import CachedInverse, get_cached_camera
 from tofclip.shots import RETURN_CHOICES, Frames, Streak
 from tofclip.solvers import LinearInverse, Method
 from tofclip.units import SPEED_OF_LIGHT

@@ -8,28 +8,6 @@ are found by the same compiled steps. `PhotonDetector` takes every pixel alone, 
 lets neighbours lend each other their photons.
 """
 
-from tofclip.lidar.photons.detector import (
-    Arrivals,
-    PhotonDetector,
-    correct_pile_up,
-    estimate_pixels,
-)
-from tofclip.lidar.photons.image import PhotonCube, PhotonImage, SurfaceImage
-from tofclip.lidar.photons.limits import Accuracy, compute_range_bound, measure_accuracy
-from tofclip.lidar.photons.scene import learn_background
-from tofclip.lidar.photons.surface import estimate_surface
+import lazy_loader as lazy
 
-__all__ = [
-    "Accuracy",
-    "Arrivals",
-    "PhotonCube",
-    "PhotonDetector",
-    "PhotonImage",
-    "SurfaceImage",
-    "compute_range_bound",
-    "correct_pile_up",
-    "estimate_pixels",
-    "estimate_surface",
-    "learn_background",
-    "measure_accuracy",
-]
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)
