@@ -326,10 +326,6 @@ def design(
     seed : int
         Of their photons.
 
-    Returns
-    -------
-    DesignReport
-
     Raises
     ------
     InputError, FileFormatError

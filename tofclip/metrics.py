@@ -22,10 +22,6 @@ def nmse(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
     border_px : int
         Pixels left out on each of the four sides of the last two axes.
 
-    Returns
-    -------
-    float
-
     Raises
     ------
     ShapeError, InputError

@@ -13,7 +13,6 @@ from tofclip.errors import FileFormatError, InputError, MissingDependencyError, 
 from tofclip.files import MAX_HASHED_BYTES
 from tofclip.sequences import jobs as jobs_module
 from tofclip.sequences.jobs import (
-    Failure,
     Job,
     connect_workers,
     count_local_workers,
@@ -38,10 +37,10 @@ def test_a_failure_is_told_and_stops_nothing(tmp_path):
     seen = []
     summary = run_jobs([refused, *jobs, stumbling], on_report=seen.append)
     assert summary.done == 3
-    assert summary.failures == (
-        Failure("broken", "unforeseen ZeroDivisionError: a defect"),
-        Failure("refused", "refused.txt: is not to be had at any price"),
-    )
+    assert [(one.name, one.problem) for one in summary.failures] == [
+        ("broken", "unforeseen ZeroDivisionError: a defect"),
+        ("refused", "refused.txt: is not to be had at any price"),
+    ]
     assert contents(tmp_path) == {"000.txt": "0", "001.txt": "1", "002.txt": "4"}
     assert [report.figures for report in seen] == [None, 0, 1, 4, None]
     assert summary.processes == 1

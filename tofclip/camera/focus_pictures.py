@@ -96,11 +96,6 @@ def calibrate_views(
     views : int
         Number of lenslets.
 
-    Returns
-    -------
-    FocusCalibration
-        Centres in px and angles in rad, each with its standard error.
-
     Raises
     ------
     ShapeError

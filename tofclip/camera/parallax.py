@@ -146,10 +146,6 @@ def find_sharpest_shears(
     progress : callable
         Called with the number of frame iterations just done.
 
-    Returns
-    -------
-    FocusCurve
-
     Raises
     ------
     InputError

@@ -54,11 +54,6 @@ def measure(
     dark : float, optional
         Dark level in counts; by default `estimate_dark_level` of the picture.
 
-    Returns
-    -------
-    Measurement
-        Measurements (slit pixels, rows) float32 and their mask.
-
     Raises
     ------
     CalibrationError

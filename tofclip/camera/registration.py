@@ -53,11 +53,6 @@ def estimate_skew(counts: Float32Array, camera: Camera) -> SkewEstimate:
     camera : Camera
         Its centres say where the views are; the view whose position is nearest 0 is the reference.
 
-    Returns
-    -------
-    SkewEstimate
-        Offsets in rows and stretches, and each view's correlation with the reference view.
-
     Raises
     ------
     CalibrationError
@@ -194,11 +189,6 @@ def register_views(
     max_rounds : int
         Refinements at most. Two leave a tenth of the first misfit's excess: enough to read what is
         written on a surface, not to measure.
-
-    Returns
-    -------
-    Registration
-        The best camera of all rounds, and the residual of each.
     """
     start, residuals, best, moved_px = camera, [], (np.inf, camera), np.inf
     for number in range(max_rounds + 1):

@@ -100,16 +100,15 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
 
 def outline_streak_file(path: str | Path) -> Record:
     """Describe the streak image in a file without reading its pixels, as `read_outline` does."""
-    outline = read_by_signature(
-        READERS, path, lambda reader: _outline(reader, Path(path)), "streak image"
-    )
+
+    def describe(reader: Reader) -> Record:
+        made = reader.describe
+        return made(Path(path)) if made else reader.read(Path(path)).to_record()
+
+    outline = read_by_signature(READERS, path, describe, "streak image")
     if outline.provenance:
         return outline
     return replace(outline, provenance=collect_provenance({"bin_width_s": None}, path))
-
-
-def _outline(reader: Reader, path: Path) -> Record:
-    return reader.read(path).to_record() if reader.describe is None else reader.describe(path)
 
 
 class StreakStack:

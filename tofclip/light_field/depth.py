@@ -154,10 +154,6 @@ def estimate_depth_from_focus(
         Price of two neighbours being one picture apart, relative to a textured pixel being out of
         focus.
 
-    Returns
-    -------
-    (rows, columns) int64 array
-
     Raises
     ------
     InputError

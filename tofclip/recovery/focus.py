@@ -221,11 +221,6 @@ def fit_parallax_to_shot(
     progress : callable
         Called with the number of frame iterations just done.
 
-    Returns
-    -------
-    ShotParallax
-        The camera with what was found, and the shears of the gates that it was found from.
-
     Raises
     ------
     CalibrationError

@@ -263,10 +263,6 @@ def plan_recovery(
     device : str
         See `tofclip.arrays.parse_device`.
 
-    Returns
-    -------
-    RecoveryPlan
-
     Raises
     ------
     CalibrationError

@@ -117,10 +117,6 @@ def open_shot(
     bin_width : float, optional
         Duration of a row, s; overrides the streak image's own time axis.
 
-    Returns
-    -------
-    Shot
-
     Raises
     ------
     MissingTimeAxisError

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from distributed import Client, Future, as_completed
 
 __all__ = [
-    "Failure",
     "Job",
     "Report",
     "Summary",
@@ -235,18 +234,10 @@ class Report:
     """What became of a job."""
 
     name: str
-    problem: str = ""  # empty if it went well
+    problem: str = ""  # in one line; empty if it went well
     figures: Any = None  # what its work returned; None as well where the result was there already
     process: str = ""  # which process did it; empty where none did
     peak_bytes: int = 0  # most memory that this process has held so far, where the system says
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A job that did not make its result, and why, in one line."""
-
-    name: str
-    problem: str
 
 
 @dataclass(frozen=True)
@@ -254,7 +245,7 @@ class Summary:
     """What became of many jobs."""
 
     done: int  # jobs whose result is there now
-    failures: tuple[Failure, ...]  # the others
+    failures: tuple[Report, ...]  # the others, by name
     processes: int  # how many took part
     peak_bytes: int  # most memory that one of them held, its program and libraries included
     seconds: float
@@ -338,14 +329,14 @@ def run_jobs(
     """
     started = time.perf_counter()
     done, peak = 0, 0
-    failures: list[Failure] = []
+    failures: list[Report] = []
     processes: set[str] = set()
     try:
         for report in map(run_job, jobs) if cluster is None else _run_on_cluster(jobs, cluster):
             if on_report is not None:
                 on_report(report)
             if report.problem:
-                failures.append(Failure(report.name, report.problem))
+                failures.append(report)
             done += not report.problem
             processes.add(report.process)
             peak = max(peak, report.peak_bytes)

@@ -264,15 +264,10 @@ EXTENT_SIGMAS = 5.0  # a Gaussian leaves 6e-7 of its energy outside
 
 
 @dataclass(frozen=True)
-class FirstHits:
-    """What rays meet first."""
+class FirstHits(Hits):
+    """What rays meet first, of several bodies."""
 
-    distance: (
-        AnyArray  # (rays,), in lengths of the ray's direction; infinite where it meets nothing
-    )
     body: AnyArray  # (rays,), number of the body; `NO_BODY` where there is none
-    normal: AnyArray  # (rays, 3), of length 1, towards the ray's origin
-    pattern_position: AnyArray  # (rays, 2), on the body's pattern
 
 
 def cast_rays(bodies: Sequence[Body], origin: AnyArray, directions: AnyArray) -> FirstHits:
@@ -290,7 +285,7 @@ def cast_rays(bodies: Sequence[Body], origin: AnyArray, directions: AnyArray) ->
         seen = rays[closer]
         nearest[seen], number[seen] = found.distance[closer], index
         normal[seen], place[seen] = found.normal[closer], found.pattern_position[closer]
-    return FirstHits(nearest, number, normal, place)
+    return FirstHits(nearest, normal, place, number)
 
 
 def look_up_reflectance(bodies: Sequence[Body], hits: FirstHits) -> AnyArray:

@@ -59,10 +59,6 @@ def make_plate(
         Turn about the vertical axis (positive: the right side goes back) and then about the plate's
         own horizontal axis (positive: the upper side goes back), rad. Both zero: facing the camera.
 
-    Returns
-    -------
-    Body
-
     Raises
     ------
     ShapeError, InputError
@@ -471,11 +467,6 @@ def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedS
     instrument : Instrument
     seed : int
         Of the photon noise; the same seed gives the same shot.
-
-    Returns
-    -------
-    SimulatedShot
-        Streak image, camera, ground truth, and expected photons (rows, columns).
 
     Raises
     ------

@@ -260,11 +260,6 @@ class Method(Protocol):
         progress : callable
             Called with the number of frame iterations just done.
 
-        Returns
-        -------
-        Result
-            Frames (frames, rows, columns) and how they came about.
-
         Raises
         ------
         ShapeError

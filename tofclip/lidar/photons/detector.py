@@ -354,11 +354,6 @@ class PhotonDetector:
         dead_bins : int, optional
             See `correct_pile_up`.
 
-        Returns
-        -------
-        Arrivals
-            Range in m, photons, and the range's Cramer-Rao deviation in m.
-
         Raises
         ------
         ShapeError, InputError
