@@ -20,7 +20,7 @@ from tofclip.recovery.surfaces.fit import (
 )
 from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, weigh_measurements
 from tofclip.recovery.surfaces.patches import bend_patches, find_plain_patches
-from tofclip.recovery.surfaces.pulse import make_pulse
+from tofclip.recovery.surfaces.pulse import ShotPulse, make_pulse, measure_pulse
 from tofclip.recovery.surfaces.ranges import (
     CLUSTER_COLUMNS,
     CLUSTER_ROWS,
@@ -616,6 +616,18 @@ def test_what_a_shot_shows_of_centres_says_how_far_the_rest_displaces_the_pictur
     ]
     # 2,000 squares know a variance to 3 %
     np.testing.assert_allclose(np.mean(np.square(told), axis=0), np.var(hidden, axis=0), rtol=0.1)
+
+
+def test_a_pulse_is_measured_alike_whatever_it_was_taken_for():
+    """So what seemed a tail, as first ranges were off, is taken back once they are right."""
+    model = make_model(simulate_shot(SCENE, INSTRUMENT, seed=0).streak)
+    amplitude = np.full(model.surface.size, 500, np.float32)
+    late = ShotPulse(model.pulse.sigma, np.array([0, 9]), np.array([0.7, 0.3]))
+    image = model.respond(late).render(amplitude)
+    for taken_for in (model, model.respond(late)):
+        light, width = taken_for.render_instants(amplitude), CAMERA.pulse_fwhm / model.bin_width
+        found = measure_pulse(light, image, np.ones_like(image), width, 0.05)
+        assert found.tail_share == pytest.approx(0.3, abs=0.03)
 
 
 def test_usual_brightness_is_that_of_the_surest_points():

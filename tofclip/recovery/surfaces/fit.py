@@ -22,7 +22,6 @@ from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, Tick, share_mi
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.patches import find_dimmer_patches, rank_within_pixels
 from tofclip.recovery.surfaces.pulse import (
-    FWHM_PER_SIGMA,
     LEAST_EXPLAINED,
     LEAST_TAIL,
     Image,
@@ -157,6 +156,12 @@ def _fit_returns(
     # way to them.
     solver, begun = straighten_surfaces(solver)
     refinement, remainder = _refine(solver, begun, tick)
+    if solver.model.pulse.reach:
+        # what seemed a tail may have been ranges that were off
+        again = _measure_pulse(solver)
+        if not again.model.pulse.reach:
+            solver = again
+            refinement, remainder = _refine(solver, refinement, tick)
     # dim light has given way a little by now
     sparse = _explain_sparsely(solver.model, solver, weight, SPARSELY)
     solver.run(iterations, tick)
@@ -168,11 +173,11 @@ def _fit_returns(
 def _measure_pulse(solver: AmplitudeSolver) -> AmplitudeSolver:
     """Give surfaces the pulse that the shot shows."""
     model, light = solver.model, solver.model.render_instants(solver.amplitude)
-    width = FWHM_PER_SIGMA * model.pulse.sigma
+    width = model.camera.pulse_fwhm / model.bin_width
     least_tail = max(LEAST_TAIL, LEAST_EXPLAINED * model.unexplained(solver.amplitude))
     pulse = measure_pulse(light, model.image, model.weights, width, least_tail)
     require_pulse(pulse)
-    if (pulse.sigma, pulse.reach) == (model.pulse.sigma, 0):
+    if (pulse.sigma, pulse.reach) == (model.pulse.sigma, model.pulse.reach):
         return solver
     return AmplitudeSolver(model.respond(pulse), solver.amplitude, solver.weight, solver)
 

@@ -264,7 +264,7 @@ class SurfaceModel:
         self.times, self.bin_width = streak.times, float(np.mean(np.diff(streak.times)))
         self.reference = int(np.argmin(np.abs(camera.view_positions)))
         self.row_m = self.bin_width * SPEED_OF_LIGHT / 2
-        self.pulse = pulse or ShotPulse(camera.pulse_fwhm / FWHM_PER_SIGMA / self.bin_width)
+        self.pulse = pulse or ShotPulse(camera.pulse_fwhm / self.bin_width / FWHM_PER_SIGMA)
         self.dark = estimate_dark_variance(streak)
         self.image, self.weights = weigh_measurements(streak, camera, self.dark)
         self._cover(masks, bases)
@@ -693,9 +693,10 @@ class SurfaceModel:
 
     def render_instants(self, amplitude: Image) -> Image:
         """Return the image, (rows, columns), of a pulse of an instant, without what follows it."""
+        plain = self.respond(ShotPulse(self.pulse.sigma)) if self.pulse.reach else self
         image, instant = np.zeros_like(self.image), (self._lags == 0).astype(np.float32)
         for view in range(self.camera.views):
-            window = self.receive(view, amplitude, instant)
+            window = plain.receive(view, amplitude, instant)
             image[window.area] += window.images[0]
         return image
 
