@@ -23,13 +23,11 @@ from tofclip.operators import (
     LinearShear,
     LineProjection,
     MaskedSensor,
-    MaskedViews,
     MeanWeighting,
     PitchedSensor,
     PointSpreadConvolution,
     RadonProjection,
     Reshape,
-    ShearedViews,
     SliceConvolution,
     SparseMatrix,
     Stack,
@@ -106,7 +104,6 @@ PORTABLE = {
     "reshape": lambda t: Reshape((3, 4, 5), (12, 5), t),
     "identity": lambda t: Identity((3, 5), t),
     "dense sensor": lambda t: DenseSensor((5, 7), t),
-    "masked views": lambda t: MaskedViews(draw(12, 4, 5, 7), t),
 }
 BUILDERS = PORTABLE | {
     "view selection": lambda t: ViewSelection((5, 3, 4), [3, 0], t),
@@ -125,7 +122,6 @@ BUILDERS = PORTABLE | {
     "slice convolution": lambda t: SliceConvolution((11, 14), draw(9, 3, 10, 9), 19, t),
     "integration": spread_views,
     "weighted views": lambda t: WeightedViews((5, 7), draw(11, 3, 4), t),
-    "sheared views": lambda t: ShearedViews((11, 14), VIEWS, 0.7, (0.3, 0), t),
     "hidden to lit wall": lambda t: hidden_to_wall([0.1, 0.05, 0.0], t),
     "hidden to scanned wall": lambda t: hidden_to_wall(None, t),
 }
@@ -322,8 +318,6 @@ def test_the_adjoint_of_the_adjoint_is_the_operator():
         lambda: Reshape((3, 4), (11,)),
         lambda: WeightedViews((9, 9), np.ones(3)),
         lambda: WeightedViews((9, 9), [[np.nan]]),
-        lambda: MaskedViews(np.ones((9, 9))),
-        lambda: MaskedViews(np.full((2, 3, 3), np.inf)),
         lambda: Integration([]),
         lambda: Integration([DenseSensor((5, 7)), MeanWeighting([3, 1, 5])]),
         lambda: Integration([DenseSensor((5, 7)), DenseSensor((5, 7), np.float64)]),

@@ -16,9 +16,7 @@ from .codes import DenseSensor as DenseSensor
 from .codes import HadamardCodes as HadamardCodes
 from .codes import LinearShear as LinearShear
 from .codes import MaskedSensor as MaskedSensor
-from .codes import MaskedViews as MaskedViews
 from .codes import PitchedSensor as PitchedSensor
-from .codes import ShearedViews as ShearedViews
 from .codes import WeightedViews as WeightedViews
 from .convolution import PointSpreadConvolution as PointSpreadConvolution
 from .convolution import SliceConvolution as SliceConvolution

@@ -31,9 +31,7 @@ from tofclip.operators.codes import (
     DenseSensor,
     HadamardCodes,
     LinearShear,
-    MaskedViews,
     PitchedSensor,
-    ShearedViews,
     View,
     WeightedViews,
     make_sheared_mask,
@@ -297,8 +295,8 @@ class CompressiveCamera(LightFieldCamera):
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): the light field's model after the shears."""
-        views = ShearedViews(self.image_shape, self.views, shear, reference)
-        return self.light_field_model() @ views
+        shears = (LinearShear(self.image_shape, shear, view, reference) for view in self.views)
+        return self.light_field_model() @ Integration([one.H for one in shears]).H
 
 
 class ApertureMaskCamera(CompressiveCamera):
@@ -385,7 +383,7 @@ class MarwahCamera(CompressiveCamera):
         return tuple(sensor @ Diagonal(code) for code in self.codes())
 
     def light_field_model(self) -> LinearOperator:
-        return MaskedViews(self.codes())
+        return DenseSensor(self.image_shape) @ Integration([Diagonal(one) for one in self.codes()])
 
 
 class SinglePixelCamera(LightFieldCamera):

@@ -13,10 +13,6 @@ from numpy.typing import ArrayLike, DTypeLike
 from tofclip.arrays import Array, FloatArray, IndexArray
 from tofclip.errors import require, require_axes
 from tofclip.operators.base import (
-    Adjoint,
-    Composition,
-    Diagonal,
-    Integration,
     LinearOperator,
     Reshape,
     Selection,
@@ -233,40 +229,6 @@ class WeightedViews(LinearOperator):
     def _adjoint(self, block: Array) -> Array:
         spread = self.weights.T @ block.reshape(len(self.weights), -1)
         return spread.reshape(*self.shape_in, -1)
-
-
-class MaskedViews(Composition):
-    """One exposure through a mask near the sensor: ``y = sum_k C_k P_k``, C_k the mask as view k
-    sees it (Eq. 18), from light fields (views, rows, columns) to (rows * columns,). `codes`
-    (views, rows, columns) are the diagonals of C_k; `dtype` float32 or float64.
-    """
-
-    def __init__(self, codes: ArrayLike, dtype: DTypeLike = np.float32) -> None:
-        masks = np.asarray(codes, dtype=dtype)
-        require_axes("mask codes", "views, rows, columns", masks.shape)
-        plane = Integration([Diagonal(mask, dtype) for mask in masks])
-        super().__init__(DenseSensor(masks.shape[1:], dtype), plane)
-
-
-class ShearedViews(Adjoint):
-    """All `views`, (v, u) each, that a picture of `image_shape` at one depth has: ``[B_1; B_2;
-    ...]``, (rows, columns) to (views, rows, columns), at a `shear` s, pixels per view step,
-    from view `reference`; `dtype` float32 or float64.
-
-    Composed with a model of the whole light field it makes that of the picture refocused at one
-    depth (Eq. 21).
-    """
-
-    def __init__(
-        self,
-        image_shape: tuple[int, int],
-        views: Sequence[View],
-        shear: float,
-        reference: View = (0.0, 0.0),
-        dtype: DTypeLike = np.float32,
-    ) -> None:
-        shears = [LinearShear(image_shape, shear, view, reference, dtype) for view in views]
-        super().__init__(Integration([one.H for one in shears]))
 
 
 def make_sheared_mask(
