@@ -22,16 +22,15 @@ from tofclip.operators import (
     Integration,
     LinearShear,
     LineProjection,
-    MaskedSensor,
     MeanWeighting,
     PitchedSensor,
     PointSpreadConvolution,
     RadonProjection,
     Reshape,
+    Selection,
     SliceConvolution,
     SparseMatrix,
     Stack,
-    ViewSelection,
     WeightedViews,
 )
 
@@ -106,7 +105,7 @@ PORTABLE = {
     "dense sensor": lambda t: DenseSensor((5, 7), t),
 }
 BUILDERS = PORTABLE | {
-    "view selection": lambda t: ViewSelection((5, 3, 4), [3, 0], t),
+    "views chosen": lambda t: Selection((5, 3, 4), (2, 3, 4), [3, 0], t),
     "linear shear": lambda t: LinearShear((11, 14), -0.7, (-4, 3), (0.3, -0.2), t),
     "Hadamard codes": lambda t: HadamardCodes((7, 13), 21, 4, t),
     "mean weighting": lambda t: MeanWeighting([3, 1, 5], 0.3, t),
@@ -116,7 +115,7 @@ BUILDERS = PORTABLE | {
     # without a lens the picture is larger than the sensor
     "beyond the sensor": lambda t: PointSpreadConvolution((21, 16), draw(7, 9, 16), (9, 7), t),
     "pitched sensor": lambda t: PitchedSensor((11, 14), (2, 3.4), (1, 0), t),
-    "masked sensor": lambda t: MaskedSensor(draw(8, 5, 9) < 0.7, t),
+    "pixels chosen": lambda t: Selection((5, 9), (3,), [7, 44, 0], t),
     # a sparse sensor behind a diffuser (supplement Note 3)
     "sparse camera": lambda t: BUILDERS["pitched sensor"](t) @ BUILDERS["point spread"](t),
     "slice convolution": lambda t: SliceConvolution((11, 14), draw(9, 3, 10, 9), 19, t),
@@ -323,8 +322,9 @@ def test_the_adjoint_of_the_adjoint_is_the_operator():
         lambda: Integration([DenseSensor((5, 7)), DenseSensor((5, 7), np.float64)]),
         lambda: Identity((37,), np.float64) @ line_projection(),
         lambda: PitchedSensor((9, 9), (2, 2), (9, 0)),
-        lambda: MaskedSensor(np.zeros((4, 4), bool)),
-        lambda: MaskedSensor(np.ones(4, bool)),
+        lambda: Selection((4, 4), (2,), [3, 3]),
+        lambda: Selection((4, 4), (2,), [3, 16]),
+        lambda: Selection((4, 4), (1,), [-1]),
     ],
 )
 def test_operators_that_do_not_fit_are_refused(build):

@@ -17,11 +17,11 @@ from tofclip.operators import (
     HadamardCodes,
     LinearShear,
     LineProjection,
-    MaskedSensor,
     MeanWeighting,
     PitchedSensor,
     PointSpreadConvolution,
     RadonProjection,
+    Selection,
     SliceConvolution,
     SparseMatrix,
     estimate_squared_norm,
@@ -242,16 +242,18 @@ def test_a_wide_code_fills_its_width_and_is_cut_at_the_border():
 
 
 def test_sensors_read_the_pixels_that_they_say():
-    picture, live = draw(3, 9, 11).astype(np.float32), draw(4, 9, 11) < 0.6
+    picture, live = draw(3, 9, 11).astype(np.float32), np.flatnonzero(draw(4, 9, 11) < 0.6)
     np.testing.assert_array_equal(DenseSensor((9, 11))(picture), picture.ravel())
-    np.testing.assert_array_equal(MaskedSensor(live)(picture), picture[live])
+    masked = Selection((9, 11), (live.size,), live)
+    np.testing.assert_array_equal(masked(picture), picture.ravel()[live])
     pitched = PitchedSensor((9, 11), (2, 3), (1, 2))
     np.testing.assert_array_equal(pitched(picture).reshape(pitched.grid_shape), picture[1::2, 2::3])
-    # 13 pitches of 30 / 26 pixels are 15, but for a rounding error downwards.
-    assert 15 * 15 in PitchedSensor((30, 15), (30 / 26, 1)).pixels
+    # 13 pitches of 30 / 26 pixels are 15, but for a rounding error downwards; 26 are not on the plane.
+    assert PitchedSensor((30, 15), (30 / 26, 1)).grid_shape == (26, 15)
+    assert 15 * 15 in PitchedSensor((30, 15), (30 / 26, 1)).chosen
     uneven = PitchedSensor((128, 128), (128 / 91, 128 / 90))
     assert uneven.grid_shape == (91, 90)
-    assert np.unique(uneven.pixels).size == 91 * 90
+    assert np.unique(uneven.chosen).size == 91 * 90
 
 
 MATRIX = scipy.sparse.random_array((31, 17), density=0.2, rng=np.random.default_rng(1)).tocsr()

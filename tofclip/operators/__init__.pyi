@@ -9,13 +9,12 @@ from .base import Integration as Integration
 from .base import LinearOperator as LinearOperator
 from .base import MeanWeighting as MeanWeighting
 from .base import Reshape as Reshape
+from .base import Selection as Selection
 from .base import Stack as Stack
-from .base import ViewSelection as ViewSelection
 from .base import estimate_squared_norm as estimate_squared_norm
 from .codes import DenseSensor as DenseSensor
 from .codes import HadamardCodes as HadamardCodes
 from .codes import LinearShear as LinearShear
-from .codes import MaskedSensor as MaskedSensor
 from .codes import PitchedSensor as PitchedSensor
 from .codes import WeightedViews as WeightedViews
 from .convolution import PointSpreadConvolution as PointSpreadConvolution

@@ -21,7 +21,6 @@ from numpy.typing import ArrayLike, DTypeLike
 from tofclip.arrays import (
     Array,
     ComputeDevice,
-    IndexArray,
     PerDevice,
     as_type,
     is_complex,
@@ -351,48 +350,33 @@ class Integration(Adjoint):
 
 
 class Selection(LinearOperator):
-    """Some of the pieces that an input is cut into along its first axes, `chosen` by their numbers; the
-    adjoint leaves the others dark.
+    """Some of the pieces that an input is cut into along its first axes: those of the numbers `chosen`,
+    without repeats, such as views of a light field, or pixels of a sensor, numbered row by row; the
+    adjoint leaves the others dark. `shape_out` is that of all of them together; `dtype` float32 or
+    float64.
     """
 
     def __init__(
-        self, shape_in: Shape, shape_out: Shape, chosen: IndexArray, dtype: DTypeLike
+        self, shape_in: Shape, shape_out: Shape, chosen: ArrayLike, dtype: DTypeLike = np.float32
     ) -> None:
         super().__init__(shape_in, shape_out, dtype)
-        self._chosen = chosen
-        self._pieces = int(np.prod(shape_in)) * chosen.size // int(np.prod(shape_out))
+        self.chosen = np.asarray(chosen, np.intp)
+        self._pieces = int(np.prod(shape_in)) * self.chosen.size // int(np.prod(shape_out))
+        different = np.unique(self.chosen)
+        require(
+            0 < different.size == self.chosen.size
+            and np.all((different >= 0) & (different < self._pieces)),
+            f"what is chosen must be one or more different numbers from 0 to {self._pieces - 1}",
+        )
 
     def _forward(self, block: Array) -> Array:
-        kept = block.reshape(self._pieces, -1)[self._chosen]
+        kept = block.reshape(self._pieces, -1)[self.chosen]
         return kept.reshape(*self.shape_out, -1)
 
     def _adjoint(self, block: Array) -> Array:
         whole = np.zeros((*self.shape_in, block.shape[-1]), self.dtype)
-        pieces = whole.reshape(self._pieces, -1)
-        pieces[self._chosen] = block.reshape(self._chosen.size, -1)
+        whole.reshape(self._pieces, -1)[self.chosen] = block.reshape(self.chosen.size, -1)
         return whole
-
-
-class ViewSelection(Selection):
-    """Keeps some of the views of a light field of `light_field_shape`, (views, rows, columns),
-    those of the numbers `kept`, without repeats; the adjoint leaves the others dark. `dtype`
-    float32 or float64.
-    """
-
-    def __init__(
-        self,
-        light_field_shape: tuple[int, int, int],
-        kept: Sequence[int],
-        dtype: DTypeLike = np.float32,
-    ) -> None:
-        self.view_indices = np.asarray(kept, np.intp)
-        require(
-            np.unique(self.view_indices).size == self.view_indices.size
-            and np.all((self.view_indices >= 0) & (self.view_indices < light_field_shape[0])),
-            f"views to keep must be different numbers from 0 to {light_field_shape[0] - 1}",
-        )
-        shape = (self.view_indices.size, *light_field_shape[1:])
-        super().__init__(light_field_shape, shape, self.view_indices, dtype)
 
 
 class MeanWeighting(LinearOperator):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from tofclip.arrays import Array, FloatArray, IndexArray
+from tofclip.arrays import Array, FloatArray
 from tofclip.errors import require, require_axes
 from tofclip.operators.base import (
     LinearOperator,
@@ -71,19 +71,7 @@ class DenseSensor(Reshape):
         super().__init__(plane_shape, (plane_shape[0] * plane_shape[1],), dtype)
 
 
-class _Sensor(Selection):
-    """The measurements of `pixels`, flat numbers on the sensor's plane."""
-
-    def __init__(self, plane_shape: tuple[int, int], pixels: IndexArray, dtype: DTypeLike) -> None:
-        require(
-            pixels.size != 0,
-            f"no pixel of the {tuple(plane_shape)} plane is read; check the sensor's mask and offset",
-        )
-        super().__init__(plane_shape, (pixels.size,), pixels, dtype)
-        self.pixels = pixels
-
-
-class PitchedSensor(_Sensor):
+class PitchedSensor(Selection):
     """Small pixels far apart: every n-th pixel of the plane is read (supplement Note 3, sparse 2D
     sensors).
 
@@ -117,23 +105,13 @@ class PitchedSensor(_Sensor):
                 f"a sensor's offset must lie on the plane of {size} px, got {offset}",
             )
             # The sum of many pitches must not fall short of a whole number by rounding.
-            axes.append(np.floor(np.arange(offset, size, pitch) + 1e-9).astype(np.intp))
+            places = np.floor(np.arange(offset, size, pitch) + 1e-9).astype(np.intp)
+            axes.append(places[places < size])
         rows, columns = axes
         pixels = (rows[:, np.newaxis] * plane_shape[1] + columns).ravel()
-        super().__init__(plane_shape, pixels, dtype)
+        super().__init__(plane_shape, (pixels.size,), pixels, dtype)
         self.grid_shape = (rows.size, columns.size)
         """Rows and columns of the sensor: measurements reshaped to it are a picture."""
-
-
-class MaskedSensor(_Sensor):
-    """Only `live` pixels, (rows, columns) bool, are read, in `dtype` float32 or float64: defective
-    ones are left out, or the sensor has any layout whatever.
-    """
-
-    def __init__(self, live: ArrayLike, dtype: DTypeLike = np.float32) -> None:
-        mask = np.asarray(live, dtype=bool)
-        require_axes("the mask of live pixels", "rows, columns", mask.shape)
-        super().__init__((mask.shape[0], mask.shape[1]), np.flatnonzero(mask), dtype)
 
 
 class HadamardCodes(LinearOperator):

@@ -26,7 +26,7 @@ from tofclip.arrays import AnyArray, FloatArray, IntArray
 from tofclip.errors import require, require_known, require_positive, require_shape
 from tofclip.light_field import FocalStack, LightField, estimate_depth_from_focus
 from tofclip.light_field.views import ClipMeasurement, make_view_warp
-from tofclip.operators import Diagonal, Identity, LinearOperator, ViewSelection
+from tofclip.operators import Diagonal, Identity, LinearOperator, Selection
 from tofclip.operators.cameras import LightFieldCamera
 from tofclip.plugins import DENOISERS, METHODS
 from tofclip.solvers import (
@@ -228,7 +228,8 @@ def recover_light_field(
         "a light field is recovered from a complete grid of views, row by row; some are missing",
     )
     weighting = camera.weighting()
-    used = ViewSelection((len(views), *measurement.image_shape), camera.used_views)
+    kept, shape = camera.used_views, measurement.image_shape
+    used = Selection((len(views), *shape), (len(kept), *shape), kept)
     model = weighting @ camera.light_field_model() @ used
     grid = (down.size, across.size)
     method = LightFieldVariation(weight, MAX_ITERATIONS, OBJECTIVE_TOLERANCE, grid=grid)
