@@ -335,7 +335,6 @@ class AshokCamera(ApertureMaskCamera):
         return used
 
     def weights(self) -> FloatArray:
-        """Return the masks."""
         from scipy.linalg import hadamard
 
         others = 1 + np.random.default_rng(self.seed).permutation(self._order - 1)

@@ -89,7 +89,6 @@ class FixedFocus(Focus):
         return f"fixed:{self.shear:g}"
 
     def plan_segments(self, camera: Camera, times: FloatArray, **others: Any) -> list[FrameSegment]:
-        """Return a single piece."""
         return [FrameSegment(slice(0, times.size), self.shear)]
 
 

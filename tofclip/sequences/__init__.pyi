@@ -1,8 +1,6 @@
 # The public names of this package and their homes; they are imported on first use.
 
-from .inputs import FileShot as FileShot
 from .inputs import Shot as Shot
-from .inputs import StackShot as StackShot
 from .inputs import is_sequence as is_sequence
 from .inputs import list_files as list_files
 from .inputs import list_shots as list_shots

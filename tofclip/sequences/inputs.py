@@ -19,36 +19,21 @@ RESULT_SUFFIXES = (".png", ".pdf", ".svg", ".ply", ".toml", ".json")
 
 
 @dataclass(frozen=True)
-class FileShot:
-    """A streak image in a file of its own, `path`; calling it reads it. `bin_width`: duration of a
-    row, s, which overrides the file's time axis.
+class Shot:
+    """A streak image in the file `path`, of a stack that of a `number`, of which no other is read;
+    calling it reads it. `bin_width`: duration of a row, s, which overrides the file's time axis.
     """
 
     path: Path
     bin_width: float | None = None
+    number: int | None = None
 
     def __call__(self) -> Streak:
         """Read the shot."""
-        return read_streak(self.path, self.bin_width)
-
-
-@dataclass(frozen=True)
-class StackShot:
-    """The streak image of that `number` in the stack `path`; calling it reads its part of the file
-    and no other. `bin_width`: duration of a row, s, which overrides the stack's time axis.
-    """
-
-    path: Path
-    number: int
-    bin_width: float | None = None
-
-    def __call__(self) -> Streak:
-        """Read the shot."""
+        if self.number is None:
+            return read_streak(self.path, self.bin_width)
         shot = StreakStack(self.path).read_shot(self.number)
         return shot if self.bin_width is None else shot.with_bin_width(self.bin_width)
-
-
-Shot = FileShot | StackShot
 
 
 def is_sequence(source: str | Path) -> bool:
@@ -71,10 +56,8 @@ def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, 
     """
     path = Path(source)
     if path.is_dir() or not path.exists():
-        return {
-            name: FileShot(file, bin_width)
-            for name, file in list_files(source, _may_be_shot).items()
-        }
+        files = list_files(source, _may_be_shot)
+        return {name: Shot(file, bin_width) for name, file in files.items()}
     import h5py
 
     if not h5py.is_hdf5(path):
@@ -85,7 +68,7 @@ def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, 
         )
     path = path.absolute()
     numbers = range(len(StreakStack(path)))
-    return {f"{path.stem}_{number:06d}": StackShot(path, number, bin_width) for number in numbers}
+    return {f"{path.stem}_{number:06d}": Shot(path, bin_width, number) for number in numbers}
 
 
 def _may_be_shot(path: Path) -> bool:

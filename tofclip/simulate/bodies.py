@@ -179,7 +179,6 @@ class Specular(Lambertian):
     def radiance(
         self, place: AnyArray, normal: AnyArray, directions: AnyArray, light: AnyArray
     ) -> AnyArray:
-        """Return the light that goes back along rays; arguments as for a matt surface."""
         matt = super().radiance(place, normal, directions, light)
         unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         mirrored = unit - 2 * np.einsum("ij,ij->i", unit, normal)[:, np.newaxis] * normal

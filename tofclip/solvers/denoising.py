@@ -190,11 +190,9 @@ class PlugAndPlay(Method):
         return True
 
     def with_data_term(self, data_term: DataTermMaker) -> Self:
-        """Return this method with another misfit, if its start has least squares."""
         return replace(self, start=self.start.with_data_term(data_term))
 
     def scale_weight(self, factor: float) -> Self:
-        """Return this method with its start's weight multiplied."""
         return replace(self, start=self.start.scale_weight(factor))
 
 

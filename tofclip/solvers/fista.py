@@ -244,7 +244,6 @@ class ProximalMethod(Method):
         return replace(self, data_term=data_term) if self.data_term is LeastSquares else self
 
     def scale_weight(self, factor: float) -> Self:
-        """Return this method with its weight multiplied."""
         return replace(self, weight=self.weight * factor)
 
     # Blocks share the cores already, and a lone picture's products are too small to share.

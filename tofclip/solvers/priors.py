@@ -9,7 +9,8 @@ other libraries a few passes with the functions of the array API standard. Nothi
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,37 +31,15 @@ class ProximalStep(NamedTuple):
     distance: Array | None = None
 
 
-class Regulariser(Protocol):
-    """A penalty R(h) whose proximal map is known, on a block of pictures; 0 where h is.
+class Regulariser(ABC):
+    """A penalty R(h) whose proximal map is known, on a block of pictures; 0 where h is. Its `weight` is
+    in the unit of ``A'f``.
 
     Attributes
     ----------
     zero_bound : float
         A frame is zero where A'f (the data term's negative gradient at zero) nowhere exceeds this.
     """
-
-    zero_bound: float
-
-    def proximal_step(
-        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
-    ) -> ProximalStep:
-        """Return ``prox_{step R}(z - step * gradient)``, a proximal gradient step. The last two
-        solutions, `current` and `previous`, and the data term's `gradient` at z are (rows, columns,
-        lanes), `momentum` and `step`, of the pictures' dtype, (lanes,). `previous` and `gradient`
-        may be overwritten, and the result lie in the former.
-        """
-        ...
-
-    def scale_dual(self, pull: Array) -> Array | None:
-        """Return by how much each frame's dual point must shrink to be feasible, (lanes,) float64,
-        or None where that is not known; `pull` is the negative gradient of the data term, (rows,
-        columns, lanes).
-        """
-        ...
-
-
-class _Prior:
-    """A prior whose weight is in the unit of ``A'f``, and whose dual is not known."""
 
     zero_bound = 0.0
 
@@ -71,7 +50,21 @@ class _Prior:
         )
         self.weight = float(weight)
 
+    @abstractmethod
+    def proximal_step(
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
+    ) -> ProximalStep:
+        """Return ``prox_{step R}(z - step * gradient)``, a proximal gradient step. The last two
+        solutions, `current` and `previous`, and the data term's `gradient` at z are (rows, columns,
+        lanes), `momentum` and `step`, of the pictures' dtype, (lanes,). `previous` and `gradient`
+        may be overwritten, and the result lie in the former.
+        """
+
     def scale_dual(self, pull: Array) -> Array | None:
+        """Return by how much each frame's dual point must shrink to be feasible, (lanes,) float64,
+        or None where that is not known; `pull` is the negative gradient of the data term, (rows,
+        columns, lanes).
+        """
         return None
 
 
@@ -88,10 +81,8 @@ def _sum_lanes(row: Array, lanes: int) -> Array:
     return row.reshape(-1, lanes).sum(axis=0, dtype=np.float64)
 
 
-class NonnegativeSparsity(_Prior):
-    """``weight * sum(h)`` for h >= 0, infinite otherwise: the l1 norm of a nonnegative picture;
-    `weight` is in the unit of ``A'f``.
-    """
+class NonnegativeSparsity(Regulariser):
+    """``weight * sum(h)`` for h >= 0, infinite otherwise: the l1 norm of a nonnegative picture."""
 
     def __init__(self, weight: float) -> None:
         super().__init__(weight)
@@ -100,7 +91,6 @@ class NonnegativeSparsity(_Prior):
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
     ) -> ProximalStep:
-        """As `Regulariser.proximal_step`."""
         if is_numpy(current):
             from tofclip.solvers.kernels import STRETCH_NUMBERS, shrink_nonnegative
 
@@ -137,7 +127,7 @@ class NonnegativeSparsity(_Prior):
         return clip_values(self.weight / steepest, highest=1.0)
 
 
-class NonnegativeTotalVariation(_Prior):
+class NonnegativeTotalVariation(Regulariser):
     """``weight * TV(h)`` for h >= 0, infinite otherwise; TV is the isotropic total variation of
     each frame.
 
@@ -149,11 +139,6 @@ class NonnegativeTotalVariation(_Prior):
     further iterations. One instance therefore belongs to one block. Steps keep their size: an inexact
     proximal map after a longer step is refused, or not, by the rounding of the last digits, and
     pictures of two devices would differ by a percent.
-
-    Parameters
-    ----------
-    weight : float
-        In the unit of ``A'f``.
     """
 
     def __init__(self, weight: float) -> None:
@@ -163,7 +148,6 @@ class NonnegativeTotalVariation(_Prior):
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
     ) -> ProximalStep:
-        """As `Regulariser.proximal_step`."""
         if self._dual is None:
             self._dual = zeros((2, *current.shape), current)
         if is_numpy(current):
@@ -227,7 +211,7 @@ def _forward_differences(picture: Array) -> Array:
     return xp.stack([below, right]) - picture
 
 
-class NonnegativeLightFieldVariation(_Prior):
+class NonnegativeLightFieldVariation(Regulariser):
     """``weight * TV(h)`` for h >= 0 over (v, u, y, x), the angular differences counted `angular`
     times; 0 leaves every view on its own.
 
@@ -293,7 +277,7 @@ WAVELET = "db4"  # by PyWavelets' name
 SHIFT_COUNT = 4  # grid positions that are averaged over
 
 
-class NonnegativeWavelets(_Prior):
+class NonnegativeWavelets(Regulariser):
     """``weight * |W h|_1`` over the details of a wavelet transform, averaged over shifts, for h >= 0.
 
     Cycle spinning (R. Coifman, D. Donoho, 1995): the picture is shifted, its details are shrunk, it
