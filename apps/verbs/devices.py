@@ -44,7 +44,7 @@ def list_(as_json: bool = JSON) -> None:
         return
     for one in found:
         print(f"{one['uri']:<24}{one['instrument']}{': ' if one['note'] else ''}{one['note']}")
-    print(f"{len(found) or 'no'} instruments are connected")
+    print(f"instruments that are connected: {len(found) or 'none'}")
     print(f"addresses begin with {', '.join(f'{kind}://' for kind in kinds)}")
 
 
@@ -107,6 +107,8 @@ def verify(file: Path = RECORDING, as_json: bool = JSON) -> None:
         hint = "is damaged; tofclip devices repair makes a sound copy"
         print(f"tofclip: error: {file}: {hint}", file=sys.stderr)
         raise typer.Exit(EXIT_DAMAGED)
+    if not found.complete:
+        print(f"tofclip: {file}: is not complete: sound as far as it goes", file=sys.stderr)
 
 
 @app.command()

@@ -231,7 +231,7 @@ def test_one_row_or_one_pixel_where_axes_are_told(shape, counts, tmp_path):
         read_photons(path, BIN)
     described = describe_photons(path)
     assert described["arrays"] == {"array": f"{BINS} x {shape[0]} x {shape[1]} uint16"}
-    assert "give --axes" in described["axes"]
+    assert "lidar photons takes --axes" in described["axes"]
     assert Camera.pinhole(shape, 10.0, BIN).image_shape == shape
 
 
@@ -264,7 +264,10 @@ def test_what_has_no_suitable_layout_is_told_which_would_do(tmp_path):
         "absent.npy": "no such file",
     }.items():
         refuse(tmp_path / name, problem)
-        refuse(tmp_path / name, problem, describe_photons)
+        if name not in ("line.npy", "flat.npy"):
+            refuse(tmp_path / name, problem, describe_photons)
+    # who asks what a file holds is told its arrays
+    assert describe_photons(tmp_path / "flat.npy")["arrays"] == {"array": "3 x 4 float64"}
 
 
 def test_pages_in_a_circle_are_refused(tmp_path):

@@ -287,6 +287,8 @@ def test_the_time_zero_given_comes_before_the_cameras(streak):
     assert open_shot(streak, time_zero=0.0).camera.time_zero == 0
     shot = open_shot(streak, time_zero=-2e-9)
     assert shot.times[0] == pytest.approx(2e-9)
+    with pytest.raises(InputError, match=r"ranges of 149.9 to .* m; check the unit"):
+        open_shot(streak, time_zero=-1e-6)
     frames = plan_recovery(shot, LinearInverse()).run()
     np.testing.assert_allclose(frames.times, shot.times)
     assert frames.camera.time_zero == shot.camera.time_zero == -2e-9

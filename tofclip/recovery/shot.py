@@ -16,12 +16,14 @@ from tofclip.io import read_streak
 from tofclip.recovery.defects import find_clipping_level, mask_defects
 from tofclip.shots import Streak
 from tofclip.solvers import Progress, ignore_progress
-from tofclip.units import PICOSECOND
+from tofclip.units import NANOSECOND, PICOSECOND, SPEED_OF_LIGHT
 
 # Of its full width at half maximum: with fewer a pulse's place is less sure.
 ROWS_PER_PULSE = 3
 MAX_ROW_PER_PULSE = 100.0
 """Longest row, in widths of the pulse: beyond, the unit of one of them is wrong."""
+# Of the time that all rows last: light that is on its way for longer tells of a wrong unit as well.
+MAX_FLIGHT_PER_SHOT = 100.0
 
 
 @dataclass(frozen=True)
@@ -146,8 +148,9 @@ def open_shot(
             f"{streak.source} carries no camera: give one (`camera`, made by tofclip calibrate)"
         )
     require_plausible_rows(streak, known)
-    streak = mask_defects(streak, known.pulse_fwhm)
-    return Shot(streak, known if time_zero is None else known.replace(time_zero=time_zero))
+    shot = Shot(streak, known if time_zero is None else known.replace(time_zero=time_zero))
+    require_plausible_time_zero(shot)
+    return replace(shot, streak=mask_defects(streak, known.pulse_fwhm))
 
 
 def require_plausible_rows(streak: Streak, camera: Camera) -> None:
@@ -168,6 +171,16 @@ def require_plausible_rows(streak: Streak, camera: Camera) -> None:
         f"{streak.source}: a row of {width / PICOSECOND:.4g} ps {fault} ({pulse / PICOSECOND:.3g} ps); "
         "check the unit of `bin_width`, or give the pulse to calibrate (`pulse`)"
     )
+
+
+def require_plausible_time_zero(shot: Shot) -> None:
+    """Refuse a shot so long after its time zero that the unit of one of them is wrong."""
+    first, last = SPEED_OF_LIGHT / 2 * shot.times[[0, -1]]
+    if 0 < last - first < first / MAX_FLIGHT_PER_SHOT:
+        raise InputError(
+            f"{shot.streak.source}: time zero {shot.camera.time_zero / NANOSECOND:.6g} ns puts its rows at ranges "
+            f"of {first:.4g} to {last:.4g} m; check the unit of `time_zero`"
+        )
 
 
 def fit_camera_to_shot(

@@ -107,11 +107,10 @@ def describe_photons(path: str | Path) -> dict[str, Any]:
     try:
         layout = _find_layout(opened, Path(path))
     except FileFormatError:
-        if not any(len(one.shape) == 3 for one in opened.arrays.values()):
-            raise
-        # a picture of one row or one pixel, whose axes no shape tells: any order shows its array
-        layout = _find_layout(opened, Path(path), "yxt")
-        axes = "not recognised: give --axes, e.g. yxt"
+        order = "yxt"[-max((len(one.shape) for one in opened.arrays.values()), default=0) :]
+        # a picture of one row or one pixel, or a line, whose axes no shape tells: any order shows its array
+        layout = _find_layout(opened, Path(path), order)
+        axes = f"not recognised: tofclip lidar photons takes --axes, e.g. {order}"
     arrays = {
         name: f"{' x '.join(map(str, entry.shape))} {'cell' if _is_cell(entry) else entry.dtype}"
         for name, entry in opened.arrays.items()
