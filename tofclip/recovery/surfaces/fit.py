@@ -485,6 +485,8 @@ def _find_others(
     # Berkeley Symp. 1, 361, 1961). The light of those that are not drawn, or dropped as all methods drop
     # them, goes to the others; and what lies about them is not theirs alone.
     drawn = doubt <= DEFAULT_FALSE_ALARM
+    if not drawn.any():
+        return others[doubt < 0.5], solver
     light = together.amplitude[own[drawn]]
     whole, own = _add_returns(solver, others[drawn], light, ABOUT_OTHERS_PX, tick)
     whole.amplitude[own] *= (1 - doubt[drawn]) * (1 - 1 / shown[drawn] ** 2)
