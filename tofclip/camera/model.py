@@ -31,6 +31,8 @@ from tofclip.notebook import render_html
 from tofclip.operators import LineProjection
 from tofclip.storage import Record, Storable, stored_array, stored_child, stored_value
 
+FAR_SPANS = 1e3  # of knots: as far beyond them nothing is interpolated
+
 
 @dataclass(frozen=True)
 class Sweep(Storable):
@@ -74,8 +76,8 @@ class SkewSweep(Sweep):
             raise CalibrationError(f"sweep centres must increase, got {self.centres_px}")
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        offset = _interpolate_linearly(column, self.centres_px, self.offsets_bin)
-        stretch = _interpolate_linearly(column, self.centres_px, self.stretches)
+        offset = interpolate_linearly(column, self.centres_px, self.offsets_bin)
+        stretch = interpolate_linearly(column, self.centres_px, self.stretches)
         raw_row, raw_column = np.broadcast_arrays(offset + (1.0 + stretch) * row, column)
         return raw_row, raw_column
 
@@ -168,16 +170,17 @@ def sweep_from_record(record: Record) -> Sweep:
     raise FileFormatError(record.origin, f"holds an unknown sweep '{record.kind}'")
 
 
-def _interpolate_linearly(
-    position: FloatArray, knots: FloatArray, values: FloatArray
-) -> FloatArray:
+def interpolate_linearly(position: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
     """Piecewise linear interpolation whose end pieces go on beyond the outer knots."""
     if knots.size == 1:
         return np.full(np.shape(position), values[0])
-    # the outer pieces go on beyond the knots, where np.interp would hold the end values
-    piece = np.clip(np.searchsorted(knots, position) - 1, 0, knots.size - 2)
-    slope = np.diff(values) / np.diff(knots)
-    return values[piece] + slope[piece] * (position - knots[piece])
+    # np.interp would hold the values of the outer knots: there are some where no position is
+    slopes, far = np.diff(values) / np.diff(knots), FAR_SPANS * (knots[-1] - knots[0])
+    values = np.concatenate(
+        [[values[0] - far * slopes[0]], values, [values[-1] + far * slopes[-1]]]
+    )
+    knots = np.concatenate([[knots[0] - far], knots, [knots[-1] + far]])
+    return np.asarray(np.interp(position, knots, values))
 
 
 # Mean over three set-ups of the same family of instruments (244, 271 and 282 px), fitted to the measured

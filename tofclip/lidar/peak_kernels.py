@@ -418,9 +418,9 @@ def cut_out(trace, background, start, held, rest):
 
 
 @compile_loop()
-def pool_significance(pixel, distance, own, starts, image_shape, limits, pooled):
-    """Add to each candidate's significance those of its neighbours at the same range. `pixel` (n,)
-    does not decrease; `distance` (n,): range, m; `starts` (pixels + 1,): first candidate of each
+def pool_neighbours(pixel, distance, own, starts, image_shape, limits, sums):
+    """Add to each candidate's sums what its neighbours at the same range have of `own`, both (n, values).
+    `pixel` (n,) does not decrease; `distance` (n,): range, m; `starts` (pixels + 1,): first candidate of each
     pixel; `limits`: radius in pixels, and gate in m for each of them.
     """
     rows, columns = image_shape
@@ -428,7 +428,6 @@ def pool_significance(pixel, distance, own, starts, image_shape, limits, pooled)
     reach = int(radius)
     for number in range(pixel.size):
         y, x = pixel[number] // columns, pixel[number] % columns
-        total = own[number]
         for j in range(-reach, reach + 1):
             for i in range(-reach, reach + 1):
                 left = radius * radius - j * j - i * i
@@ -440,8 +439,8 @@ def pool_significance(pixel, distance, own, starts, image_shape, limits, pooled)
                 there = (y + j) * columns + x + i
                 for k in range(starts[there], starts[there + 1]):
                     if math.fabs(distance[k] - distance[number]) <= most:
-                        total += own[k]
-        pooled[number] = total
+                        for value in range(own.shape[1]):
+                            sums[number, value] += own[k, value]
 
 
 # Which candidates of a pixel are one surface, whose light the recovery spread over time. The views are

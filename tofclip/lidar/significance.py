@@ -187,7 +187,7 @@ class EvidenceJudge:
         if pixel.size == 0:
             return np.empty(0)
         # the compiler takes as long to import as all else
-        from tofclip.lidar.peak_kernels import pool_significance
+        from tofclip.lidar.peak_kernels import pool_neighbours
 
         width, distance = self.pulse.fwhm, SPEED_OF_LIGHT / 2 * time
         shape = self.frames.camera.image_shape
@@ -196,24 +196,19 @@ class EvidenceJudge:
         # further a neighbour is, like a ball
         ball = POOL_RADIUS_PX, GATE_PULSES_PER_PX * SPEED_OF_LIGHT / 2 * width
 
-        def sum_around(own: FloatArray) -> FloatArray:
-            """Sum over each candidate and those around it at the same range."""
-            pooled = np.empty(own.size)
-            pool_significance(pixel, distance, own, starts, shape, ball, pooled)
-            return pooled
-
         # what the model does not explain is known by its brightness
         noise = replace(self.noise, misfit=0.0, dazzle=np.inf)
         own, missing, light = weigh_candidates(self.frames, noise, self.pulse, pixel, time, signal)
-        pooled, neighbours = sum_around(own), sum_around(np.ones(own.size))
+        intensity = signal * distance**2
+        each = np.stack([own, np.ones(own.size), light, missing, intensity], axis=1)
+        sums = each.copy()  # over each candidate and those around it at the same range
+        pool_neighbours(pixel, distance, each, starts, shape, ball, sums)
+        pooled, neighbours, explained, unexplained, around = np.ascontiguousarray(sums.T)
         most = AT_INSTANT.compute_least_intensity(pixel, time, pooled, width, time)
         # float32's least: a quotient by float64's may overflow
-        explained = np.maximum(sum_around(light), np.finfo(np.float32).tiny)
-        excess = sum_around(missing) / explained
+        excess = unexplained / np.maximum(explained, np.finfo(np.float32).tiny)
         # of what is hardly seen, noise makes as much
         excess = np.clip(excess, *EXCESS_LIMITS) * pooled**2 / (pooled**2 + 4 * neighbours)
-        intensity = signal * distance**2
-        around = sum_around(intensity)
         ratios = [
             around / find_brightness_at_instant(time, around, width),
             intensity / find_brightness(intensity),
@@ -273,10 +268,13 @@ def weigh_candidates(
     alive = np.isfinite(measured).any(axis=1, keepdims=True)
     # blocks of one shear
     number = frames.times.size
-    changes = np.flatnonzero(np.diff(frames.shears)) + 1
+    changes = np.flatnonzero(np.diff(frames.shears, prepend=np.nan))
     edges = np.union1d(changes, [*range(0, number, FRAMES_PER_BLOCK), number])
     for start, stop in pairwise(edges.tolist()):
-        operator = frames.camera.operator(float(frames.shears[start])).matrix
+        if start in changes:
+            operator = frames.camera.operator(float(frames.shears[start])).matrix
+            squares = operator.copy()
+            squares.data = squares.data**2
         pictures = values[start:stop].reshape(stop - start, -1).T.astype(np.float32)
         explained = operator @ pictures
         variance = noise.compute_variance(np.maximum(explained, 0))
@@ -287,8 +285,6 @@ def weigh_candidates(
         rest = measured[:, start:stop] - explained
         told = np.isfinite(rest)
         rest[~told] = 0
-        squares = operator.copy()
-        squares.data = squares.data**2
         known = squares.T @ precision
         exceeds, explains, seen_light = (
             operator.T @ (part * precision) for part in (rest, explained, told * explained)

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, estimate_dark_level
+from tofclip.camera.model import interpolate_linearly
 from tofclip.lidar import compute_ray_directions
 from tofclip.recovery.defects import estimate_noise
 from tofclip.recovery.surfaces.patches import MIN_BEHIND_FRACTION
@@ -130,42 +131,6 @@ def compare_smoothed(predicted: Image, measured: Image, valid: NDArray[np.bool_]
     return error / signal if signal else 1.0
 
 
-class BetweenCentres(NamedTuple):
-    """Between which two views' centres points fall on the slit."""
-
-    before: NDArray[np.intp]  # (points,), the centre before each
-    # (points,), the way from there to the next centre, 0 to 1; outside the outer centres below or
-    # beyond, as the sweep goes on linearly there
-    fraction: FloatArray
-
-    @classmethod
-    def find(cls, centres: FloatArray, column: FloatArray) -> BetweenCentres:
-        """Return where places on the slit lie between the centres."""
-        if centres.size == 1:
-            return cls(np.zeros(column.size, np.intp), np.zeros(column.size))
-        before = np.clip(np.searchsorted(centres, column) - 1, 0, centres.size - 2)
-        return cls(before, (column - centres[before]) / (centres[before + 1] - centres[before]))
-
-    def interpolate(self, values: FloatArray) -> FloatArray:
-        """Return what each point has of values at the centres, (views,)."""
-        after = np.minimum(self.before + 1, values.size - 1)
-        return np.asarray((1 - self.fraction) * values[self.before] + self.fraction * values[after])
-
-    def weigh_centre(self, view: int) -> FloatArray:
-        """Return how much each point has of the value at one centre."""
-        upto = np.where(self.before == view, 1 - self.fraction, 0.0)
-        return upto + np.where(self.before + 1 == view, self.fraction, 0.0)
-
-
-def find_rows(times: FloatArray, time: FloatArray) -> FloatArray:
-    """Return where instants lie on a time axis, in rows; it need not be even, and goes on beyond its
-    ends as there.
-    """
-    first, last = times[1] - times[0], times[-1] - times[-2]
-    before, after = np.minimum(time - times[0], 0) / first, np.maximum(time - times[-1], 0) / last
-    return np.asarray(np.interp(time, times, np.arange(times.size)) + before + after)
-
-
 class Places(NamedTuple):
     """Parts of the points' pixels, each so small that its light arrives at one instant: a pixel on
     a surface that is turned far spans many bins of range.
@@ -222,7 +187,7 @@ class Footprint(NamedTuple):
     first_column: int  # of the slit, of which the view has a part
     lit_rows: NDArray[np.int64]  # (n,), which smoothed light reaches; none where the view is dark
     reached_rows: NDArray[np.int64]  # (n,), before it is smoothed
-    between: BetweenCentres  # of the points
+    slit: FloatArray  # (points,), columns before the sweep distorts them
     height: FloatArray  # (points,), see `measure_height`
     rows_per_instant: float  # raw rows in the time of one, on average
 
@@ -433,10 +398,9 @@ class SurfaceModel:
         from tofclip.recovery.surfaces import kernels
 
         rows, margin, samples = self._rows, self._margin, kernels.SPLINE_SAMPLES
-        row, column, between, pace = self._locate(view, x, y, right, shear)
+        row, column, slit, pace = self._locate(view, x, y, right, shear)
         first_parts = self.places.starts[:-1]
-        between = BetweenCentres(between.before[first_parts], between.fraction[first_parts])
-        height = self.measure_height(row[first_parts])
+        place = slit[first_parts], self.measure_height(row[first_parts])
         row += self.before
         columns = self.image.shape[1]
         away, last = margin + samples, rows + margin - samples
@@ -446,14 +410,15 @@ class SurfaceModel:
         seen = first[~dark]  # the others are among these
         np.clip(first, seen.min(initial=last), seen.max(initial=-margin), out=first)
         slit_first = np.empty(row.size, np.int32)
-        slit = np.empty((row.size, SLIT_PIXELS), np.float32)
+        slit_shares = np.empty((row.size, SLIT_PIXELS), np.float32)
         outward, further = self._reach_out(view)
         column += outward
         along = np.clip(column, -SLIT_PIXELS, columns + SLIT_PIXELS)
         tangent = float(np.tan(self.camera.angles[view]))
         across, down = self.places.size
-        kernels.split_over_slit(along, across * (1 + further), down, tangent, slit_first, slit)
-        slit[along != column] = 0
+        across = across * (1 + further)
+        kernels.split_over_slit(along, across, down, tangent, slit_first, slit_shares)
+        slit_shares[along != column] = 0
         left = int(slit_first.min(initial=columns))
         wide = max(int(slit_first.max(initial=-SLIT_PIXELS)) + SLIT_PIXELS - left, 0)
         hit = np.bincount(first + margin, minlength=rows + 2 * margin)
@@ -464,9 +429,9 @@ class SurfaceModel:
         high = int(lines.max()) + margin + 1 - top if lines.size else 0
         first -= np.int32(top)
         slit_first -= np.int32(left)
-        light = first, shares, slit_first, slit, (high, wide), top, left
+        light = first, shares, slit_first, slit_shares, (high, wide), top, left
         reached_rows = np.flatnonzero(reached) - margin - top
-        return Footprint(*light, lines - top, reached_rows, between, height, pace)
+        return Footprint(*light, lines - top, reached_rows, *place, pace)
 
     def _reach_out(self, view: int) -> tuple[FloatArray, FloatArray]:
         """Where a view's picture ends beyond the outer columns: by how much parts of points lie further to
@@ -480,23 +445,22 @@ class SurfaceModel:
 
     def _locate(
         self, view: int, x: FloatArray, y: FloatArray, right: FloatArray, shear: FloatArray
-    ) -> tuple[FloatArray, FloatArray, BetweenCentres, float]:
-        """Where parts of points fall in a view, (places,): row and column of the raw streak image,
-        between which centres, and how many raw rows the time of one takes.
+    ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Where parts of points fall in a view, (places,): row and column of the raw streak image, and
+        column before the sweep distorts it; and how many raw rows the time of one takes.
         """
         camera, position = self.camera, self.camera.view_positions[view]
         distance, aside = self.places.distance, camera.lenslet_pitch * position
         back = np.sqrt(distance**2 + aside * (aside - 2 * right))
-        column = (
+        column = slit = (
             camera.centres_px[view]
             + self.state.centres[view]
             + x
             - y * np.tan(camera.angles[view])
             + shear * position
         )
-        between = BetweenCentres.find(camera.centres_px, column)
         time = (distance + back) / SPEED_OF_LIGHT + camera.time_zero
-        row, pace = find_rows(self.times, time), 1.0
+        row, pace = interpolate_linearly(time, self.times, np.arange(self.times.size)), 1.0
         if camera.sweep is not None:
             few = slice(None, None, PACE_PLACES)
             later, _ = camera.sweep.raw_position(row[few] + 0.5, column[few])
@@ -504,9 +468,10 @@ class SurfaceModel:
             pace = 2 * float(np.mean(later - row[few])) if row.size else 1.0
             column = np.array(raw_column, np.float64)
         delay, stretch = (
-            between.interpolate(one) for one in (self.state.delays, self.state.stretches)
+            interpolate_linearly(slit, camera.centres_px, one)
+            for one in (self.state.delays, self.state.stretches)
         )
-        return row + delay + stretch * self.measure_height(row), column, between, pace
+        return row + delay + stretch * self.measure_height(row), column, slit, pace
 
     def measure_height(self, row: NDArray[Any]) -> FloatArray:
         """Return rows as fractions of the streak image from its middle."""

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
+from tofclip.camera.model import interpolate_linearly
 from tofclip.recovery.surfaces.amplitudes import (
     explain_by_amplitude,
     scale_amplitude,
@@ -156,9 +157,9 @@ def _differentiate_view(model: SurfaceModel, amplitude: Image, view: int) -> lis
 
 def _differentiate_sweep(model: SurfaceModel, amplitude: Image, view: int) -> list[Derivatives]:
     """By delay and stretch at a view's centre, which the views beside it feel as well."""
-    windows = []
+    windows, centres = [], model.camera.centres_px
     for other, place in enumerate(model.footprints):
-        weight = place.between.weigh_centre(view)
+        weight = interpolate_linearly(place.slit, centres, np.eye(centres.size)[view])
         if not weight.any():
             continue
         light = amplitude * weight

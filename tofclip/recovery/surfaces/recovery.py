@@ -9,6 +9,7 @@ import scipy
 
 from tofclip.arrays import FloatArray
 from tofclip.camera import measure
+from tofclip.camera.model import interpolate_linearly
 from tofclip.errors import InputError
 from tofclip.lidar import Detection
 from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
@@ -18,7 +19,7 @@ from tofclip.recovery.surfaces.fit import (
     START_ITERATIONS,
     fit_surfaces,
 )
-from tofclip.recovery.surfaces.model import SurfaceModel, find_rows
+from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, Image
 from tofclip.recovery.surfaces.returns import list_returns
 from tofclip.recovery.surfaces.start import call_dark, estimate_darkness
@@ -141,7 +142,8 @@ class SurfaceRecovery:
 def _render_frames(start: Frames, model: SurfaceModel, amplitude: Image) -> Image:
     """The surfaces as a reference view without blur would see them over time."""
     lit = np.flatnonzero(amplitude)
-    row = find_rows(start.times, 2 * model.distance[lit] / SPEED_OF_LIGHT)
+    time = 2 * model.distance[lit] / SPEED_OF_LIGHT
+    row = interpolate_linearly(time, start.times, np.arange(start.times.size))
     sigma = model.pulse.sigma
     half = int(np.ceil(EXTENT_SIGMAS * sigma + 0.5))
     rows = np.round(row).astype(np.intp)[:, np.newaxis] + np.arange(-half, half + 2)
