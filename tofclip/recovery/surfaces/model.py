@@ -460,7 +460,7 @@ class SurfaceModel:
             + shear * position
         )
         time = (distance + back) / SPEED_OF_LIGHT + camera.time_zero
-        row, pace = interpolate_linearly(time, self.times, np.arange(self.times.size)), 1.0
+        row, pace = interpolate_linearly(time, self.times, np.arange(float(self.times.size))), 1.0
         if camera.sweep is not None:
             few = slice(None, None, PACE_PLACES)
             later, _ = camera.sweep.raw_position(row[few] + 0.5, column[few])

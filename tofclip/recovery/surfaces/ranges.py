@@ -549,8 +549,11 @@ def _eliminate_amplitude(
         functions, _ = shares[group.names[0][1]]
         area = slice(functions.shape[1]), *group.area
         images[area] += _combine(functions, group.images)
+    counts = np.array([functions.shape[1] for functions, _ in shares])[model.surface]
     for number, (image, change) in enumerate(zip(images, changes, strict=False)):
-        change[:] = explain_by_amplitude(model, image, change, scale, iterations)
+        # quadrics have more of them than others: theirs alone change amplitudes then
+        free = np.where(counts > number, scale, np.float32(0))
+        change[:] = explain_by_amplitude(model, image, change, free, iterations)
         if start is None and number == 0:
             # a smooth multiple of a derivative takes nearly that multiple of its change
             for surface, (functions, _) in enumerate(shares):

@@ -143,7 +143,7 @@ def _render_frames(start: Frames, model: SurfaceModel, amplitude: Image) -> Imag
     """The surfaces as a reference view without blur would see them over time."""
     lit = np.flatnonzero(amplitude)
     time = 2 * model.distance[lit] / SPEED_OF_LIGHT
-    row = interpolate_linearly(time, start.times, np.arange(start.times.size))
+    row = interpolate_linearly(time, start.times, np.arange(float(start.times.size)))
     sigma = model.pulse.sigma
     half = int(np.ceil(EXTENT_SIGMAS * sigma + 0.5))
     rows = np.round(row).astype(np.intp)[:, np.newaxis] + np.arange(-half, half + 2)
