@@ -40,67 +40,35 @@ MARGIN_PULSES = 4.0  # of the sweep before the nearest light and after the farth
 
 @dataclass(frozen=True)
 class Design:
-    """The description of an instrument; keys of a TOML file, with their units.
+    """The description of an instrument; keys of a TOML file, with their units."""
 
-    Parameters
-    ----------
-    sensor : str
-        "slit" of a streak camera or "1d" line of counting pixels, on which all lenslets lie beside
-        each other; "2d", one sparse area sensor behind a diffuser; "0d", a single pixel with codes
-        behind each lenslet.
-    views : int
-        Lenslets, in a row.
-    pitch_mm, focus_distance_m : float
-        Between lenslets, and where their pictures coincide; `inf` is far away.
-    focal_length_px : float
-    angles_deg : tuple of float
-        Of the lines from the vertical; evenly from -45 to 45 by default. Slit and 1d only.
-    rows_px, columns_px : int
-        The picture.
-    sensor_px : int
-        Pixels of the slit or line; 0 gives each view as many as its lines cross.
-    centres_px : tuple of float
-        Of the views on it; evenly by default.
-    sampling_ratio : float
-        Of 2d and 0d: readings over pixels of the picture.
-    bins, bin_width_ps, pulse_ps
-        Time axis and full width at half maximum of the response.
-    photons, background_photons : float
-        Expected of the brightest reading in a bin, and of every one.
-    near_m, far_m : float
-        Range of the scene.
-    shots_per_second : float
-    occluder_mm, occluder_distance_m : float
-        Width of a solid occluder on the axis and its distance; 0: none.
-    damping : float
-        mu over the largest eigenvalue of A A'.
-    max_angle_deg : float
-        The steepest line that better angles may have.
-    """
-
+    #: "slit" of a streak camera or "1d" line of counting pixels, on which all lenslets lie beside each
+    #: other; "2d", one sparse area sensor behind a diffuser; "0d", a single pixel with codes behind
+    #: each lenslet
     sensor: str = "slit"
-    views: int = 7
-    pitch_mm: float = 2.3
-    focus_distance_m: float = 2.3
+    views: int = 7  #: lenslets, in a row
+    pitch_mm: float = 2.3  #: between lenslets
+    focus_distance_m: float = 2.3  #: where their pictures coincide; `inf` is far away
     focal_length_px: float = 560.0
+    #: of the lines from the vertical; evenly from -45 to 45 by default. Slit and 1d only
     angles_deg: tuple[float, ...] = ()
-    rows_px: int = 128
+    rows_px: int = 128  #: of the picture
     columns_px: int = 128
-    sensor_px: int = 0
-    centres_px: tuple[float, ...] = ()
-    sampling_ratio: float = 0.25
+    sensor_px: int = 0  #: of the slit or line; 0 gives each view as many as its lines cross
+    centres_px: tuple[float, ...] = ()  #: of the views on it; evenly by default
+    sampling_ratio: float = 0.25  #: of 2d and 0d: readings over pixels of the picture
     bins: int = 576
     bin_width_ps: float = 20.0
-    pulse_ps: float = 60.0
-    photons: float = 2000.0
-    background_photons: float = 2.0
-    near_m: float = 1.7
+    pulse_ps: float = 60.0  #: full width at half maximum of the response
+    photons: float = 2000.0  #: expected of the brightest reading in a bin
+    background_photons: float = 2.0  #: of every one
+    near_m: float = 1.7  #: where the scene begins, and where it ends
     far_m: float = 3.2
     shots_per_second: float = 30.0
-    occluder_mm: float = 0.0
+    occluder_mm: float = 0.0  #: width of a solid occluder on the axis; 0: none
     occluder_distance_m: float = 0.0
-    damping: float = 1e-2
-    max_angle_deg: float = 60.0
+    damping: float = 1e-2  #: mu over the largest eigenvalue of A A'
+    max_angle_deg: float = 60.0  #: the steepest line that better angles may have
 
     def __post_init__(self) -> None:
         for item in fields(self):

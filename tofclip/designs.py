@@ -271,30 +271,19 @@ def try_out(design: Design, scene: Scene, shots: int = 20, seed: int = 0) -> Acc
 
 @dataclass(frozen=True)
 class DesignReport:
-    """What is known of an instrument before it is built; `design` makes it.
-
-    Parameters
-    ----------
-    design : Design
-    sight : Sight
-        At the middle of its range.
-    figures : mapping
-        By name, with units at the end: ``field_of_view_deg`` (down, across); ``overlap_near`` and
-        ``overlap_far``, share of the picture's width that all views have in common;
-        ``sensor_overlap``, share of the slit that several views use; ``undetermined``;
-        ``refocus_nearest_m``, from where on the outermost views have half of their
-        field in common; ``refocus_planes``,
-        distances that the views' parallax tells apart between near and far; ``inactive_m`` behind
-        the occluder; ``bytes_per_second``.
-    predicted, simulated : mapping
-        Of scenes' names to `Accuracy`.
-    """
+    """What is known of an instrument before it is built; `design` makes it."""
 
     design: Design
-    sight: Sight
+    sight: Sight  #: at the middle of its range
+    #: By name, with units at the end: ``field_of_view_deg`` (down, across); ``overlap_near`` and
+    #: ``overlap_far``, share of the picture's width that all views have in common;
+    #: ``sensor_overlap``, share of the slit that several views use; ``undetermined``;
+    #: ``refocus_nearest_m``, from where on the outermost views have half of their field in common;
+    #: ``refocus_planes``, distances that the views' parallax tells apart between near and far;
+    #: ``inactive_m`` behind the occluder; ``bytes_per_second``
     figures: Mapping[str, Any]
-    predicted: Mapping[str, Accuracy]
-    simulated: Mapping[str, Accuracy]
+    predicted: Mapping[str, Accuracy]  #: by the names of scenes
+    simulated: Mapping[str, Accuracy]  #: the same
 
     def __repr__(self) -> str:
         known = self.design
