@@ -269,18 +269,16 @@ def build_occluded_model(
 
 
 def separate_occluder(
-    measurements: TimedMeasurements,
-    weight: float = TV_WEIGHT,
-    returns: tuple[Return, ...] | None = None,
+    measurements: TimedMeasurements, returns: tuple[Return, ...] | None = None
 ) -> SeparatedImages:
     """Recover occluder and target from their returns, by default those found in the measurements; of a
-    single one the target's pictures are zero. `weight` is that of total variation.
+    single one the target's pictures are zero.
     """
     returns = measurements.find_returns() if returns is None else returns
     require(returns, "no light comes back; is the clock set to the scene's distances?")
     distances = tuple(one.distance for one in returns)
     shears = [float(measurements.rig.array.shear(distance)) for distance in distances]
-    usual = ClipRecovery(weight=weight)
+    usual = ClipRecovery(weight=TV_WEIGHT)
     pictures = [
         usual.recover(measurements.measurement(one.bins), shear).picture
         for one, shear in zip(returns, shears, strict=True)
@@ -292,7 +290,7 @@ def separate_occluder(
     weighting = rig.camera.weighting()
     model = weighting @ build_occluded_model(rig, mask, (shears[0], shears[1]))
     gated = weighting(measurements.sum_gate(returns[1].bins))[:, np.newaxis]
-    method = TotalVariation(weight, MAX_ITERATIONS, OBJECTIVE_TOLERANCE)
+    method = TotalVariation(TV_WEIGHT, MAX_ITERATIONS, OBJECTIVE_TOLERANCE)
     target = method.recover(model, gated).frames[0]
     return SeparatedImages(occluder, target, pictures[1], distances)
 

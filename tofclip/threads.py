@@ -59,12 +59,12 @@ def _mark_worker() -> None:
 
 
 @contextmanager
-def open_worker_pool(threads: int | None = None) -> Iterator[Executor]:
-    """Yield an executor with `threads`, by default one for each core, for jobs that each keep to one
-    core; BLAS has one thread meanwhile. At the end of the block, jobs that have not begun are cancelled
-    and those under way waited for.
+def open_worker_pool() -> Iterator[Executor]:
+    """Yield an executor with a thread for each core, for jobs that each keep to one core; BLAS has one
+    thread meanwhile. At the end of the block, jobs that have not begun are cancelled and those under
+    way waited for.
     """
-    pool = ThreadPoolExecutor(threads or thread_count(), "tofclip", _mark_worker)
+    pool = ThreadPoolExecutor(thread_count(), "tofclip", _mark_worker)
     with limit_blas_threads():
         try:
             yield pool

@@ -168,11 +168,11 @@ def render_view(scene: Scene, array: CameraArray, view: View) -> AnyArray:
     return by_pixel.mean(axis=(1, 3)).astype(np.float32)
 
 
-def render_shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) -> AnyArray:
-    """Return the shear of what a view sees in the middle of each pixel, (rows, columns) float32,
-    pixels per view step; infinite where it sees nothing.
+def render_shear_map(scene: Scene, array: CameraArray) -> AnyArray:
+    """Return the shear of what the reference view sees in the middle of each pixel, (rows, columns)
+    float32, pixels per view step; infinite where it sees nothing.
     """
-    origin, directions = array.rays(view, 1)
+    origin, directions = array.rays((0.0, 0.0), 1)
     distance, _ = _shade_rays(scene, origin, directions)
     seen = np.isfinite(distance)
     depth = np.where(seen, distance, 1.0) * array.focus  # directions reach to the plane in focus

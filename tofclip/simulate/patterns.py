@@ -16,7 +16,7 @@ Pattern = Float32Array
 STROKE_WIDTH = 0.26  # width of a letter's stroke
 TEXELS = 192  # per side; finer than the rays at every range that the rest of this room uses
 TEXT_TEXELS = 384  # per side of writing and mottled paint, which have finer detail
-LINE_SPACING = 1.3  # of capital letters' height
+LINE_SPACING, MARGIN = 1.3, 0.08  # of capital letters' height; of the rectangle
 
 
 def _make_arc(
@@ -103,11 +103,9 @@ def make_rings(number: int, dark: float, bright: float) -> Pattern:
     return np.where(radius <= 1, dark + (bright - dark) * wave, np.nan).astype(np.float32)
 
 
-def make_text_pattern(
-    text: str, ink: float, paper: float = float("nan"), margin: float = 0.08
-) -> Pattern:
-    """Bold capitals that fill a rectangle but for a margin, a fraction of it; each line is as wide as
-    the rectangle. A paper of NaN leaves letters that are cut out.
+def make_text_pattern(text: str, ink: float, paper: float = float("nan")) -> Pattern:
+    """Bold capitals that fill a rectangle but for a margin; each line is as wide as the rectangle. A
+    paper of NaN leaves letters that are cut out.
     """
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
@@ -117,13 +115,13 @@ def make_text_pattern(
         all(line.strip() for line in lines), "every line of a writing needs at least one letter"
     )
     font = FontProperties(family="DejaVu Sans", weight="bold")
-    step = (1 - 2 * margin) / (len(lines) * LINE_SPACING - LINE_SPACING + 1)
+    step = (1 - 2 * MARGIN) / (len(lines) * LINE_SPACING - LINE_SPACING + 1)
     middle = (np.arange(TEXT_TEXELS) + 0.5) / TEXT_TEXELS
     inside = np.zeros((TEXT_TEXELS, TEXT_TEXELS), bool)
     for number, line in enumerate(lines):
         outline = TextPath((0, 0), line, size=10, prop=font)
-        box, top = outline.get_extents(), margin + number * step * LINE_SPACING
-        x = box.x0 + (middle - margin) / (1 - margin - margin) * box.width
+        box, top = outline.get_extents(), MARGIN + number * step * LINE_SPACING
+        x = box.x0 + (middle - MARGIN) / (1 - MARGIN - MARGIN) * box.width
         y = box.y1 - (middle - top) / (top + step - top) * box.height
         points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         inside |= outline.contains_points(points).reshape(inside.shape)

@@ -399,7 +399,7 @@ class Wavelets(ProximalMethod):
 INITIAL_WEIGHT = 10**-1.75  # relative weight that is tried first
 WEIGHT_RATIO = 10**0.375  # between one trial and the next
 MAX_TRIALS = 10  # from the first weight this reaches three decades up or down
-FOLD_COUNT = 8  # parts of the measurements; each is predicted from the other seven
+FOLD_COUNT, FOLD_SEED = 8, 0  # parts of the measurements; each is predicted from the other seven
 # Runs of measurements of which one fold alone is a fair sample: the others are not tried.
 SINGLE_FOLD_RUNS = 4096
 # Recoveries that a choice of a weight takes at most, and that it reports when it is done.
@@ -421,7 +421,6 @@ def choose_weight(
     operator: LinearOperator,
     measurements: Array,
     run: int,
-    seed: int = 0,
     progress: Progress = ignore_progress,
     first: float = INITIAL_WEIGHT,
     max_folds: int = FOLD_COUNT,
@@ -442,7 +441,7 @@ def choose_weight(
     eight folds it takes less time and knows the error less well.
     """
     require_numpy("the choice of a prior's weight", measurements)
-    held = assign_folds(measurements.size, run, seed)[:, :max_folds]
+    held = assign_folds(measurements.size, run, FOLD_SEED)[:, :max_folds]
     parts = np.split(held, held.shape[1], axis=1)
     column = measurements[:, np.newaxis]
 

@@ -270,16 +270,16 @@ class PhotonImage:
         offsets, bins = table.indptr.astype(np.int64), table.indices.astype(np.float32)
         return replace(self, offsets=offsets, bin=bins, count=table.data, cycles=float(cycles))
 
-    def even_out(self, edges: FloatArray, sigma: FloatArray, seed: int = 0) -> PhotonImage:
+    def even_out(self, edges: FloatArray, sigma: FloatArray) -> PhotonImage:
         """Return the same photons, in whole bins, on an even time axis, on which bins begin and end at
         `edges` (bins + 1,), none of them longer than two; `sigma`: see `bin_sigma`. Which of two or
-        three even bins a photon came in is left to chance, by a `seed`: counts stay Poisson's.
+        three even bins a photon came in is left to chance: counts stay Poisson's.
         """
         code = self.bin.astype(np.int64)
         begin, length = edges[code], edges[code + 1] - edges[code]
         first = np.minimum(np.floor(begin), self.bins - 1)
         one, two = (np.clip((first + n - begin) / length, 0, 1) for n in (1, 2))
-        noise, number = np.random.default_rng(seed), np.rint(self.count).astype(np.int64)
+        noise, number = np.random.default_rng(0), np.rint(self.count).astype(np.int64)
         late = number - noise.binomial(number, one)
         last = noise.binomial(late, np.clip((1 - two) / np.maximum(1 - one, 1e-12), 0, 1))
         count = np.stack([number - late, late - last, last], axis=1).astype(np.float32).ravel()
