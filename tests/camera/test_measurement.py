@@ -16,9 +16,7 @@ from tofclip.camera import (
 )
 from tofclip.camera.focus_pictures import calibrate_views
 from tofclip.camera.noise import MeasurementNoise
-from tofclip.camera.rectifier import RowSums
 from tofclip.errors import CalibrationError, InputError, ShapeError
-from tofclip.threads import LANES
 
 WIDTH, ROWS = 61, 80
 TURN = np.array([[1.01, 0.02, -0.7], [-0.03, 0.98, 1.3], [1e-4, -2e-4, 1.0]])
@@ -152,51 +150,6 @@ def test_the_variance_of_a_measurement_by_hand():
     assert MeasurementNoise.from_figures(noise.list_figures()) == noise
 
 
-LONG_ROWS, SUM_WIDTH, LENGTH = 200, 75, 5
-SKEW = SkewSweep(np.array([20.0, 55.0]), np.array([-6.0, 9.5]), np.array([0.01, -0.02]))
-TURNED = ProjectiveSweep(TURN * [[1], [1], [0.1]] + np.diag([0, 0, 0.9]))
-
-
-def make_rectifier(sweep=SKEW):
-    dead = np.arange(SUM_WIDTH) == 20
-    made = Camera([37.0], [0.0], (8, 8), SUM_WIDTH, sweep=sweep, dead_columns=dead)
-    return Rectifier(made, LONG_ROWS)
-
-
-def long_streak(seed=0):
-    counts = np.random.default_rng(seed).poisson(90, (LONG_ROWS, SUM_WIDTH)).astype(np.float32)
-    counts[60:130] += 300
-    return counts
-
-
-@pytest.mark.parametrize("sweep", [SKEW, TURNED, None])
-def test_sums_are_those_of_rectified_rows(sweep):
-    rectifier, counts = make_rectifier(sweep), long_streak()
-    # more than the threads' blocks; the last ones begin anew, as of instants that fill a vector up
-    starts = np.append(np.arange(0, LONG_ROWS - LENGTH, 2), np.zeros(LANES, int))[: 4 * LANES]
-    starts = np.pad(starts, (0, 4 * LANES - starts.size))
-    sums = np.full((SUM_WIDTH, starts.size + 3), -1, np.float32)
-    dark = RowSums(rectifier, starts, LENGTH).add_up(counts, sums)
-    assert dark == estimate_dark_level(counts)
-    rows = starts[:, np.newaxis] + np.arange(LENGTH)
-    # sums of 500 counts before the dark level is taken off
-    expected = rectifier.rectify(counts)[:, rows].sum(axis=2)
-    np.testing.assert_allclose(sums[:, :-3], expected, atol=1e-3)
-    assert np.all(sums[:, -3:] == -1)
-    assert not sums[20, :-3].any()
-    outside = ~rectifier.inside.T[:, rows].any(axis=2)
-    assert outside.any() or sweep is None
-    assert not sums[:, :-3][outside].any()
-
-
-@pytest.mark.parametrize("sweep", [SKEW, TURNED])
-def test_some_rows_are_rectified_as_all_are(sweep):
-    rectifier, counts = make_rectifier(sweep), long_streak(1)
-    numbers = np.array([0, 3, 4, 100, LONG_ROWS - 1])
-    found = rectifier.rectify_rows(counts, 90.0, numbers)
-    np.testing.assert_array_equal(found, rectifier.rectify(counts, dark=90.0)[:, numbers])
-
-
 def test_what_cannot_be_measured_is_refused():
     with pytest.raises(CalibrationError, match="61 columns but the camera's slit has 64"):
         measure(streak(), None, camera(slit_width_px=64))
@@ -208,12 +161,6 @@ def test_what_cannot_be_measured_is_refused():
         measure(np.full((ROWS, WIDTH), 7, np.float32), None, camera())
     with pytest.raises(ShapeError):
         Rectifier(camera(), ROWS).measure(streak()[:-1])
-    adder = RowSums(make_rectifier(), np.arange(LANES), LENGTH)
-    sums = np.empty((SUM_WIDTH, LANES), np.float32)
-    with pytest.raises(InputError, match="dark level"):
-        adder.add_up(np.full((LONG_ROWS, SUM_WIDTH), 7, np.float32), sums)
-    with pytest.raises(InputError, match="streak image of this camera"):
-        adder.add_up(long_streak()[:-1], sums)
 
 
 CENTRES = np.array([95.3, 250.8, 405.1, 560.6])

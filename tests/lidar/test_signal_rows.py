@@ -47,7 +47,7 @@ def find_bins(inverse):
     def find(measurements, limit=5.0, cuts=(0, ROWS)):
         blocks = [RowBlock(slice(*ends), inverse) for ends in pairwise(cuts)]
         finder = SignalRowFinder(blocks, 3.0, limit, REACH)
-        return finder.bins(finder.sum_measurements(measurements))
+        return finder.bins(measurements)
 
     return find
 

@@ -17,7 +17,6 @@ from tofclip.vectors import (
     fill_vector,
     load_vector,
     store_vector,
-    sum_vector,
 )
 
 fast_loop = compile_loop(fastmath=True)
@@ -52,15 +51,14 @@ def sample_row(counts, dark, position, runs, reading):
             first += ONE
 
 
-@compile_loop(fastmath=True)
-def sample_rows(counts, dark, raw_row, runs, run_starts, numbers, measurements):
-    """Sample the rows `numbers`; `runs` are those of all rows, one after the other, and row r's begin
-    at ``run_starts[r]``.
+@fast_loop
+def sample_rows(counts, dark, raw_row, runs, run_starts, measurements):
+    """Sample some rows; `runs` are those of all rows, one after the other, of which row r's begin at
+    ``run_starts[r]``.
     """
-    for place in range(numbers.size):
-        row = numbers[place]
+    for row in range(raw_row.shape[0]):
         own = runs[run_starts[row] : run_starts[row + 1]]
-        sample_row(counts, dark, raw_row[row], own, measurements[place])
+        sample_row(counts, dark, raw_row[row], own, measurements[row])
 
 
 @compile_loop(fastmath=True, _nrt=True)
@@ -124,66 +122,6 @@ def sum_boxes(measurements, starts, length, span, sums):
             start = starts[first + instant]
             add_rows(measurements[start : start + length], room[instant])
         write_transposed(room, first, sums)
-
-
-@compile_loop(fastmath=True, _nrt=True)
-def sum_sampled_boxes(
-    counts, raw_row, runs, run_starts, starts, length, span, raw_span, sums, row_sums
-):
-    """Do as `sum_boxes` with rows that are sampled meanwhile, each once and without a dark level, and
-    add up the raw rows of `raw_span`: about those that the sums look at, which are in the cache then.
-    """
-    columns = counts.shape[1]
-    room, ring = np.empty((LENGTH, columns), np.float32), np.empty((length, columns), np.float32)
-    held = np.full(length, -1)
-    raw = raw_span[0]
-    for first in range(np.uintp(span[0]), np.uintp(span[1]), STEP):
-        for instant in range(STEP):
-            start = starts[first + instant]
-            while raw < min(start + length, raw_span[1]):
-                row_sums[raw] = add_columns(counts[raw])
-                raw += 1
-            for row in range(start, start + length):
-                place = row % length
-                if held[place] != row:
-                    own = runs[run_starts[row] : run_starts[row + 1]]
-                    sample_row(counts, np.float32(0), raw_row[row], own, ring[place])
-                    held[place] = row
-            add_rows(ring, room[instant])
-        write_transposed(room, first, sums)
-    while raw < raw_span[1]:
-        row_sums[raw] = add_columns(counts[raw])
-        raw += 1
-
-
-@inlined
-def add_columns(row):
-    """Sum of a row of float32."""
-    one = other = fill_vector(np.float32(0))
-    columns, column = np.uintp(row.size), np.uintp(0)
-    while column + STEP + STEP <= columns:
-        one += load_vector(row, column)
-        other += load_vector(row, column + STEP)
-        column += STEP + STEP
-    total = sum_vector(one + other)
-    while column < columns:
-        total += row[column]
-        column += ONE
-    return total
-
-
-@fast_loop
-def subtract_dark_level(measured, dark, sums, lit):
-    """Take the dark level off sums of rows, (columns, sums), as often as each has measurements, and say
-    whether anything of a column rises above it. What was not measured is zero, and stays so.
-    """
-    for column in range(measured.shape[0]):
-        here, number, above = sums[column], measured[column], np.float32(0)
-        for k in range(number.size):
-            here[k] -= number[k] * dark
-        for k in range(number.size):
-            above += np.float32(here[k] > 0)
-        lit[column] = above > 0
 
 
 @fast_loop

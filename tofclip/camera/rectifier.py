@@ -1,10 +1,4 @@
-"""From a raw streak image to the measurements that the forward operator predicts, and sums of
-successive rectified rows.
-
-Of most shots few rows hold light. To find them, sums over a pulse's length do, for which no
-rectified picture has to be written and read again; nor need the dark level be known beforehand,
-which takes a look at all rows as well.
-"""
+"""From a raw streak image to the measurements that the forward operator predicts."""
 
 from __future__ import annotations
 
@@ -17,7 +11,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import BoolArray, Float32Array, IndexArray, IntArray
 from tofclip.camera.model import Camera
 from tofclip.errors import CalibrationError, require, require_shape
-from tofclip.threads import LANES, count_block_threads, run_blocks, split_blocks
+from tofclip.threads import run_blocks, split_blocks
 
 DARK_ROW_FRACTION = 0.05
 ROWS_PER_BLOCK = 64
@@ -76,26 +70,22 @@ def require_width(counts: Float32Array, camera: Camera) -> None:
         )
 
 
-def estimate_dark_level(counts: Float32Array, row_sums: Float32Array | None = None) -> float:
-    """Median of the quietest rows of `counts`, (rows, columns), whose sums are `row_sums`,
-    (rows,), where they are known already.
+def estimate_dark_level(counts: Float32Array) -> float:
+    """Median of the quietest rows of `counts`, (rows, columns).
 
     Taken from whole rows, before or after the light came, so that it stays where the
     measurements scatter about it: the least value of a picture would turn noise into an offset.
     """
-    quiet, _ = part_quiet_rows(counts, row_sums)
+    quiet, _ = part_quiet_rows(counts)
     # the median, which NumPy looks for ten times as long as it sorts
     ordered = np.sort(counts[quiet], axis=None)
     return float((ordered[(ordered.size - 1) // 2] + ordered[ordered.size // 2]) / 2)
 
 
-def part_quiet_rows(
-    counts: Float32Array, row_sums: Float32Array | None = None
-) -> tuple[IndexArray, IndexArray]:
-    """Return the numbers of the quietest rows, and of all others; arguments as for `estimate_dark_level`."""
-    if row_sums is None:
-        # a product, which reads the picture at the rate of memory: NumPy's sum takes thrice as long
-        row_sums = counts @ np.ones(counts.shape[1], np.float32)
+def part_quiet_rows(counts: Float32Array) -> tuple[IndexArray, IndexArray]:
+    """Return the numbers of the quietest rows of `counts`, (rows, columns), and of all others."""
+    # a product, which reads the picture at the rate of memory: NumPy's sum takes thrice as long
+    row_sums = counts @ np.ones(counts.shape[1], np.float32)
     # Rows, not pixels: choosing the darkest pixels would choose those whose noise is low.
     order = np.argsort(row_sums)
     number = max(1, round(DARK_ROW_FRACTION * row_sums.size))
@@ -156,56 +146,30 @@ class Rectifier:
         cannot leave out single ones: 0 beyond the raw image and in dead columns. All columns of a
         row lie side by side in memory, as in the raw picture.
         """
-        level = estimate_dark_level(counts) if dark is None else dark
-        measurements = self._sample(counts, level, delay)
+        from tofclip.camera.kernels import sample_bilinear, sample_delayed_rows, sample_rows
+
+        raw, shift = self._prepare(counts), np.float32(delay)
+        level = np.float32(estimate_dark_level(counts) if dark is None else dark)
+        measurements = np.empty_like(raw)
+
+        def work(piece: slice) -> None:
+            row, found = self._raw_row[piece], measurements[piece]
+            if self._stays_in_column and delay == 0:
+                runs, starts = self._runs
+                sample_rows(raw, level, row, runs, starts[piece.start : piece.stop + 1], found)
+            elif self._stays_in_column:
+                sample_delayed_rows(raw, level, row, shift, found)
+            else:
+                column = np.ascontiguousarray(self._raw_column[piece])
+                sample_bilinear(raw, level, row, column, shift, found)
+
+        run_blocks(work, len(measurements), ROWS_PER_BLOCK)
+        # Zero, not their raw value: methods that take no mask must not see a stuck column as light.
+        measurements[:, self._dead] = 0
         # Some rows at a time: noise about the dark level is above it in the first ones already.
         pieces = split_blocks(len(measurements), ROWS_PER_BLOCK)
         require(any(measurements[piece].max() > 0 for piece in pieces), NO_LIGHT_MESSAGE)
         return measurements.T
-
-    def rectify_rows(self, counts: Float32Array, dark: float, numbers: IntArray) -> Float32Array:
-        """Return the measurements of the rows `numbers` of `counts` above `dark`, (columns, n), as
-        `rectify` does.
-        """
-        return self._sample(counts, dark, 0.0, numbers).T
-
-    def _sample(
-        self,
-        counts: Float32Array,
-        dark: float,
-        delay: float,
-        numbers: IntArray | None = None,
-    ) -> Float32Array:
-        """Some or all rectified rows, (rows, columns)."""
-        from tofclip.camera.kernels import sample_bilinear, sample_delayed_rows, sample_rows
-
-        raw, level, shift = self._prepare(counts), np.float32(dark), np.float32(delay)
-        size = len(self._raw_row) if numbers is None else numbers.size
-        measurements = np.empty((size, counts.shape[1]), np.float32)
-
-        def work(piece: slice) -> None:
-            some = piece if numbers is None else numbers[piece]
-            if self._stays_in_column and delay == 0:
-                which = np.arange(size)[piece] if numbers is None else some
-                sample_rows(raw, level, self._raw_row, *self._runs, which, measurements[piece])
-            elif self._stays_in_column:
-                sample_delayed_rows(raw, level, self._raw_row[some], shift, measurements[piece])
-            else:
-                column = np.ascontiguousarray(self._raw_column[some])
-                sample_bilinear(raw, level, self._raw_row[some], column, shift, measurements[piece])
-
-        run_blocks(work, size, ROWS_PER_BLOCK)
-        # Zero, not their raw value: methods that take no mask must not see a stuck column as light.
-        measurements[:, self._dead] = 0
-        return measurements
-
-    @property
-    def inside(self) -> BoolArray:
-        """Where the raw image has what a rectified pixel shows, (rows, columns)."""
-        rows, columns = self._raw_row.shape
-        inside = (self._raw_row >= 0) & (self._raw_row <= rows - 1)
-        inside &= (self._raw_column >= 0) & (self._raw_column <= columns - 1)
-        return inside
 
     @cached_property
     def _runs(self) -> tuple[NDArray[np.uint64], IntArray]:
@@ -243,60 +207,3 @@ class Rectifier:
         require_width(counts, self.camera)
         require_shape("a streak image of this camera", self._raw_row.shape, counts.shape)
         return np.ascontiguousarray(counts, np.float32)
-
-
-class RowSums:
-    """Sums of `length` successive rectified rows that begin at `starts`, a multiple of `LANES` of them:
-    what stays the same from shot to shot. Memory: as much as the sums.
-    """
-
-    def __init__(self, rectifier: Rectifier, starts: IntArray, length: int) -> None:
-        self._rectifier, self._starts, self._length = rectifier, starts, length
-        inside = np.pad(np.cumsum(rectifier.inside, axis=0, dtype=np.uint16), ((1, 0), (0, 0)))
-        # how many rows of each sum lie within the raw image; differences are right beyond 65,535 too
-        measured = (inside[starts + length] - inside[starts]).T
-        self._measured = np.ascontiguousarray(measured, np.float32)
-        self._measured[rectifier.camera.dead_columns] = 0
-
-    def add_up(self, counts: Float32Array, sums: Float32Array) -> float:
-        """Overwrite `sums` (columns, at least sums) by those of a shot's measurements; return its dark
-        level, which is taken off. They are 0 where nothing was measured.
-        """
-        # the compiler takes as long to import as all else
-        from tofclip.camera.kernels import subtract_dark_level
-
-        dark = estimate_dark_level(counts, self._add_rows(counts, sums))
-        measured, lit = self._measured, np.zeros(self._measured.shape[0], bool)
-
-        def work(piece: slice) -> None:
-            subtract_dark_level(measured[piece], np.float32(dark), sums[piece], lit[piece])
-
-        run_blocks(work, lit.size, -(-lit.size // count_block_threads()))
-        require(lit.any(), NO_LIGHT_MESSAGE)
-        return dark
-
-    def _add_rows(self, counts: Float32Array, sums: Float32Array) -> Float32Array:
-        """Add up rectified rows as they are; return the sum of each raw row, (rows,)."""
-        from tofclip.camera.kernels import sum_boxes, sum_sampled_boxes
-
-        rectifier, starts, length = self._rectifier, self._starts, self._length
-        raw, row_sums = rectifier._prepare(counts), np.empty(len(counts), np.float32)
-        lanes = -(-starts.size // (count_block_threads() * LANES)) * LANES
-        if not rectifier._stays_in_column:
-            rectified = rectifier._sample(counts, 0.0, 0.0)
-            run_blocks(
-                lambda piece: sum_boxes(rectified, starts, length, (piece.start, piece.stop), sums),
-                starts.size,
-                lanes,
-            )
-            return counts @ np.ones(counts.shape[1], np.float32)
-
-        def work(piece: slice) -> None:
-            ends = piece.start, piece.stop
-            raw_span = tuple(len(raw) * end // starts.size for end in ends)
-            rows = rectifier._raw_row, *rectifier._runs
-            sum_sampled_boxes(raw, *rows, starts, length, ends, raw_span, sums, row_sums)
-
-        run_blocks(work, starts.size, lanes)
-        sums[rectifier._dead, : starts.size] = 0
-        return row_sums

@@ -16,8 +16,6 @@ import numpy as np
 import scipy
 
 from tofclip.arrays import BoolArray, Float32Array, FloatArray, IntArray, empty_aligned
-from tofclip.camera import Rectifier
-from tofclip.camera.rectifier import RowSums
 from tofclip.errors import InputError
 from tofclip.lidar.pulse_tables import TraceBins
 from tofclip.operators.sparse import Tiles
@@ -178,44 +176,14 @@ class SignalRowFinder:
             self._owners.append((finders[inverse], slice(first, last)))
         self._middles = np.concatenate(middles)
         self._taken = self._middles >= 0
-        self._row_sums: RowSums | None = None
         self._starts = np.clip(self._middles - self._length // 2, 0, self.rows - self._length)
 
-    def sum_measurements(self, measurements: Float32Array) -> Float32Array:
-        """Add up rectified measurements, (columns, rows), as `bins` needs them."""
-        from tofclip.camera.kernels import sum_boxes
-
-        sums = self._allocate_sums(measurements.shape[0])
-        by_rows = np.ascontiguousarray(measurements.T)  # as the rectifier leaves them: no copy
-
-        def work(piece: slice) -> None:
-            sum_boxes(by_rows, self._starts, self._length, (piece.start, piece.stop), sums)
-
-        run_blocks(work, self._starts.size, _divide_into_lanes(self._starts.size))
-        return sums
-
-    def sum_streak(self, counts: Float32Array, rectifier: Rectifier) -> tuple[Float32Array, float]:
-        """Add up the measurements of a raw streak image, (rows, columns), and return its dark level,
-        counts, as well. The camera is that of the first shot, and so is its `rectifier`.
+    def bins(self, measurements: Float32Array) -> TraceBins:
+        """Return the rows of rectified measurements, (columns, rows), that are worth recovering, and a
+        sample of the dark ones that stands for the rest. All rows, if a quarter of the shot is not
+        nearly as dark as the darkest twentieth, or if not much would be left out.
         """
-        if self._row_sums is None:
-            self._row_sums = RowSums(rectifier, self._starts, self._length)
-        sums = self._allocate_sums(counts.shape[1])
-        return sums, self._row_sums.add_up(counts, sums)
-
-    def _allocate_sums(self, columns: int) -> Float32Array:
-        """As weights have it: whole cache lines, and a gap between columns, of zeros."""
-        instants = self._starts.size
-        sums: Float32Array = empty_aligned((columns, instants + GAP_INSTANTS), np.float32)
-        sums[:, instants:] = 0
-        return sums
-
-    def bins(self, sums: Float32Array) -> TraceBins:
-        """Return the rows worth recovering, and a sample of the dark ones that stands for the rest.
-        All rows, if a quarter of the shot is not nearly as dark as the darkest twentieth, or if not
-        much would be left out. `sums` of `sum_measurements` or `sum_streak` are overwritten.
-        """
-        lit = self._find_signal_bins(sums)
+        lit = self._find_signal_bins(self._sum_boxes(measurements))
         searched = self._mark_rows_near(lit, self._step // 2 + 1)
         kept = self._mark_rows_near(lit, self._step // 2 + 1 + self._reach)
         number = MIN_DARK_ROWS + -(int(kept.sum()) + MIN_DARK_ROWS) % LANES
@@ -227,6 +195,21 @@ class SignalRowFinder:
         bin_weights[dark[chosen]] = dark.size / number
         numbers = np.flatnonzero(bin_weights)
         return TraceBins(numbers, searched[numbers], bin_weights[numbers])
+
+    def _sum_boxes(self, measurements: Float32Array) -> Float32Array:
+        """Sums over a pulse's length about each instant, (columns, instants), and a gap of zeros."""
+        from tofclip.camera.kernels import sum_boxes
+
+        instants = self._starts.size
+        sums = empty_aligned((len(measurements), instants + GAP_INSTANTS), np.float32)
+        sums[:, instants:] = 0
+        by_rows = np.ascontiguousarray(measurements.T)  # as the rectifier leaves them: no copy
+
+        def work(piece: slice) -> None:
+            sum_boxes(by_rows, self._starts, self._length, (piece.start, piece.stop), sums)
+
+        run_blocks(work, instants, _divide_into_lanes(instants))
+        return sums
 
     def _find_signal_bins(self, sums: Float32Array) -> BoolArray:
         from tofclip.lidar.signal_row_kernels import compute_energies, standardise_columns

@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -45,7 +45,7 @@ from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse, PreparedInverse, ProximalMethod, Sparse
 from tofclip.solvers.direct import InverseTraces, order_by_patch
 
-__all__ = ["RangingPipeline", "SummedShot", "build_cloud_path"]
+__all__ = ["RangingPipeline", "build_cloud_path"]
 
 # Of each shot but the first, which has the method's own number. Of a moving scene's points, with 300
 # photons in the brightest pixel, 17 % are false after 4, 9 % after 8, 5 % after 12 (the linear
@@ -291,13 +291,6 @@ class AveragedPipeline:
         return self._pipeline.search(found)
 
 
-class SummedShot(NamedTuple):
-    """What a look at all rows of a shot brings."""
-
-    sums: Float32Array  # (columns, instants and some), see `SignalRowFinder.bins`
-    dark: float  # dark level, counts
-
-
 class RangingPipeline:
     """Makes clouds of shots of one camera, by the linear inverse or by a method with a prior.
 
@@ -385,25 +378,20 @@ class RangingPipeline:
         """
         expected = self.camera.slit_width_px, self.times.size
         require_shape("measurements", expected, measurements.shape)
-        bins = self._lit.bins(self._lit.sum_measurements(measurements))
+        bins = self._lit.bins(measurements)
         # by rows, which is how measurements lie in memory
-        return self._recover_bins(np.take(measurements.T, bins.numbers, axis=0).T, bins)
-
-    def _recover_bins(self, measurements: Float32Array, bins: TraceBins) -> Traces:
-        """Recover from measurements (columns, bins)."""
+        held = np.take(measurements.T, bins.numbers, axis=0).T
         if self._warm_start is not None:
-            return self._warm_start.recover(measurements, bins)
-        return _ShotTraces(self, measurements, bins)
+            return self._warm_start.recover(held, bins)
+        return _ShotTraces(self, held, bins)
 
-    def rectify(self, shot: Streak) -> SummedShot:
-        """Look at all rows of a shot once: their sums over a pulse's length, rectified."""
-        return SummedShot(*self._lit.sum_streak(shot.counts, self.rectifier))
+    def rectify(self, shot: Streak) -> Float32Array:
+        """Return a shot's measurements, (columns, rows)."""
+        return self.rectifier.rectify(shot.counts)
 
-    def recover_shot(self, shot: Streak, rectified: SummedShot) -> Traces:
-        """As `recover`, rectifying the rows with light and no others; `rectified` is overwritten."""
-        bins = self._lit.bins(rectified.sums)
-        measurements = self.rectifier.rectify_rows(shot.counts, rectified.dark, bins.numbers)
-        return self._recover_bins(measurements, bins)
+    def recover_shot(self, shot: Streak, rectified: Float32Array) -> Traces:
+        """As `recover`."""
+        return self.recover(rectified)
 
     def search(self, found: Traces) -> Returns:
         """Find the returns in what `recover` returned."""
