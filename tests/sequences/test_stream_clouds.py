@@ -56,6 +56,19 @@ def test_a_stream_gives_the_clouds_of_its_shots():
     np.testing.assert_allclose(np.diff(medians), -0.05, atol=2e-3)
 
 
+def test_what_columns_have_at_all_times_changes_no_cloud():
+    """Of 5e4 photons at the brightest, ambient light has as many as a fifth, and its noise alone is left."""
+    made = shots(2)
+    ambient = 5e3 * (1 + np.sin(np.arange(200) / 9))
+    random = np.random.default_rng(0)
+    lit = [
+        replace(one, counts=one.counts + random.poisson(ambient, one.counts.shape)) for one in made
+    ]
+    for one, other in zip(stream_clouds(made), stream_clouds(lit), strict=True):
+        assert len(other.cloud) == pytest.approx(len(one.cloud), rel=0.05)
+        assert np.median(other.cloud.range) == pytest.approx(np.median(one.cloud.range), abs=1e-3)
+
+
 def test_measurements_are_averaged_as_far_as_nothing_changes():
     first, last = shots(2)
     random, dim = np.random.default_rng(0), 3e-3  # 150 photons at the peak

@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 import scipy
 
-from tofclip.arrays import BoolArray, Float32Array
+from tofclip.arrays import BoolArray, Float32Array, FloatArray
 from tofclip.camera import Measurement, estimate_dark_level
 from tofclip.camera.noise import MeasurementNoise, find_dazzle_limit
 from tofclip.camera.rectifier import part_quiet_rows
@@ -177,14 +177,13 @@ def find_dead_columns(counts: Float32Array, noise: float) -> BoolArray:
     return dead if dead.mean() <= MAX_CONSTANT_FRACTION else np.zeros(dead.shape, bool)
 
 
-def level_columns(streak: Streak) -> Streak:
-    """Return a streak image without what its columns have at all times more or less than the usual one, as
-    of ambient light or a dark level of their own; the same where that is nothing.
+def measure_levels(counts: Float32Array) -> FloatArray:
+    """Return what columns have at all times more or less than the usual one, (columns,), as of ambient light
+    or a dark level of their own; 0 where that is no more than noise.
 
     That is by how much the dark readings of columns differ in all other rows, as far as they do so in the
     quietest rows as well: light that comes and goes does not.
     """
-    counts = streak.counts.astype(np.float32)
     dark, noise, gain = estimate_noise(counts)
     quiet, others = part_quiet_rows(counts)
     rest = counts[others]
@@ -199,11 +198,14 @@ def level_columns(streak: Streak) -> Streak:
     share = float(level @ seen) / energy if energy else 0.0
     # what quiet rows leave of it is their noise
     if not share * np.sqrt(energy) > MIN_SIGNIFICANCE * np.std(seen - share * level):
-        return streak
-    # what is cut off stays as bright as all that is
-    cut_off = counts >= find_clipping_level(counts)
-    counts = np.where(cut_off, counts, counts - np.float32(share) * level)
-    return replace(streak, counts=counts.astype(np.float32))
+        return np.zeros(level.size)
+    return np.asarray(share * level, np.float64)
+
+
+def take_levels(counts: Float32Array, levels: FloatArray) -> Float32Array:
+    """Return a streak image without its columns' levels; what is cut off stays as bright as all that is."""
+    level = counts - levels.astype(np.float32)
+    return np.where(counts >= find_clipping_level(counts), counts, level).astype(np.float32)
 
 
 def mask_defects(streak: Streak, pulse_fwhm: float) -> Streak:
@@ -214,7 +216,9 @@ def mask_defects(streak: Streak, pulse_fwhm: float) -> Streak:
     rows = streak.counts.shape[0]
     if rows < 2:
         return streak
-    streak, times = level_columns(streak), streak.times
+    levels, times = measure_levels(streak.counts.astype(np.float32)), streak.times
+    if levels.any():
+        streak = replace(streak, counts=take_levels(streak.counts, levels))
     defects = find_defects(streak, pulse_fwhm * (rows - 1) / float(times[-1] - times[0]))
     if not defects.count:
         return streak

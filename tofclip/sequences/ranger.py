@@ -9,7 +9,7 @@ carry the same camera share its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -262,28 +262,26 @@ class StillAverage:
         return np.asarray((inside - self._offset) * self._gain + self._dark, np.float32)
 
 
-class AveragedPipeline:
-    """Makes clouds of streak images averaged by `StillAverage`, of `most` shots. Shots are taken in
-    order.
-    """
-
-    in_order = True
+class ChangedPipeline:
+    """Makes clouds of streak images whose counts are changed first, as by `StillAverage`."""
 
     def __init__(
-        self, pipeline: RangingPipeline | SurfacePipeline, most: int, first: Streak
+        self,
+        pipeline: RangingPipeline | SurfacePipeline,
+        changes: Sequence[Callable[[Float32Array], Float32Array]],
+        in_order: bool,
     ) -> None:
-        self._pipeline, self.camera = pipeline, pipeline.camera
-        self.method_name = pipeline.method_name
-        pulse_rows = self.camera.pulse_fwhm / float(np.mean(np.diff(first.times)))
-        self._average = StillAverage(first.counts, pulse_rows, most)
+        self._pipeline, self._changes, self.in_order = pipeline, changes, in_order
+        self.camera, self.method_name = pipeline.camera, pipeline.method_name
 
     def rectify(self, shot: Streak) -> tuple[Streak, Any]:
-        """Average a shot with those before, and do what can be done before anything is recovered."""
-        averaged = replace(shot, counts=self._average.add(shot.counts))
-        return averaged, self._pipeline.rectify(averaged)
+        """Change a shot, and do what can be done before anything is recovered."""
+        for change in self._changes:
+            shot = replace(shot, counts=change(shot.counts))
+        return shot, self._pipeline.rectify(shot)
 
     def recover_shot(self, shot: Streak, rectified: tuple[Streak, Any]) -> Any:
-        """Do what the pipeline does with the average."""
+        """Do what the pipeline does with the changed shot."""
         return self._pipeline.recover_shot(*rectified)
 
     def search(self, found: Any) -> Returns:

@@ -20,15 +20,24 @@ from threading import Condition, RLock, Thread
 from time import perf_counter
 from typing import Any, Literal, NamedTuple, Protocol
 
+import numpy as np
+
+from tofclip.arrays import Float32Array
 from tofclip.camera import Camera
 from tofclip.errors import InputError, TofclipError, require
 from tofclip.lidar import PointCloud, point_cloud
 from tofclip.lidar.photons import PhotonCube
 from tofclip.plugins import METHODS
 from tofclip.recovery import Focus, SharpestFocus, SurfaceRecovery
+from tofclip.recovery.defects import measure_levels, take_levels
 from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.sequences.counting import PhotonPipeline
-from tofclip.sequences.ranger import AveragedPipeline, RangingPipeline, SurfacePipeline
+from tofclip.sequences.ranger import (
+    ChangedPipeline,
+    RangingPipeline,
+    StillAverage,
+    SurfacePipeline,
+)
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse, ProximalMethod
 from tofclip.threads import open_worker_pool, thread_count
@@ -117,7 +126,15 @@ def make_pipeline(
         pipeline = SurfacePipeline.for_shot(shot, camera, time_zero, chosen)
     else:
         pipeline = RangingPipeline.for_shot(shot, camera, focus, time_zero, chosen)
-    return pipeline if average == 1 else AveragedPipeline(pipeline, average, shot)
+    changes: list[Callable[[Float32Array], Float32Array]] = []
+    levels = measure_levels(shot.counts.astype(np.float32))
+    if levels.any():
+        changes.append(partial(take_levels, levels=levels))
+    if average > 1:
+        pulse_rows = pipeline.camera.pulse_fwhm / float(np.mean(np.diff(shot.times)))
+        changes.append(StillAverage(shot.counts, pulse_rows, average).add)
+    in_order = average > 1 or pipeline.in_order
+    return ChangedPipeline(pipeline, changes, in_order) if changes else pipeline
 
 
 Policy = Literal["block", "drop_oldest"]
