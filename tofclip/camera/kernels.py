@@ -148,24 +148,3 @@ def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
             value = upper + (y - np.float32(top)) * (lower - upper) - dark
             inside = y >= 0 and y <= last_row and x >= 0 and x <= last_column
             reading[column] = value if inside else np.float32(0)
-
-
-@compile_loop()
-def mark_valid(bad, raw_row, raw_column, delay, valid):
-    """Mark the measurements that lie within the raw image and to which no bad pixel contributes;
-    positions as for `sample_bilinear`.
-    """
-    rows, columns = bad.shape
-    for row in range(valid.shape[0]):
-        for column in range(valid.shape[1]):
-            y, x = raw_row[row, column] + delay, raw_column[row, column]
-            valid[row, column] = 0 <= y <= rows - 1 and 0 <= x <= columns - 1
-            if valid[row, column]:
-                top, left = np.uintp(y), np.uintp(x)
-                # a pixel right on another one has nothing of the next
-                below, beside = (
-                    top + np.uintp(y > np.float32(top)),
-                    left + np.uintp(x > np.float32(left)),
-                )
-                if bad[top, left] or bad[top, beside] or bad[below, left] or bad[below, beside]:
-                    valid[row, column] = False

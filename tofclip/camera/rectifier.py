@@ -128,8 +128,9 @@ class Rectifier:
         says.
         """
         self._prepare(counts)
-        bad = np.zeros(counts.shape, bool) if saturated is None else saturated
-        valid = self._find_valid(bad, delay)
+        # where all that contributes is good the sum of its weights is whole
+        good = np.ones(counts.shape, np.float32) if saturated is None else ~saturated
+        valid = (self._sample(good.astype(np.float32), 0.0, delay) == 1).T
         require(
             valid.any(),
             "no measurement can be trusted: every pixel is saturated, dead or outside the sweep",
@@ -146,11 +147,20 @@ class Rectifier:
         cannot leave out single ones: 0 beyond the raw image and in dead columns. All columns of a
         row lie side by side in memory, as in the raw picture.
         """
+        level = estimate_dark_level(counts) if dark is None else dark
+        measurements = self._sample(self._prepare(counts), level, delay)
+        # Some rows at a time: noise about the dark level is above it in the first ones already.
+        pieces = split_blocks(len(measurements), ROWS_PER_BLOCK)
+        require(any(measurements[piece].max() > 0 for piece in pieces), NO_LIGHT_MESSAGE)
+        return measurements.T
+
+    def _sample(self, raw: Float32Array, dark: float, delay: float) -> Float32Array:
+        """The rectified picture of a raw one, (rows, columns); 0 beyond it and in dead columns: methods
+        that take no mask must not see a stuck column as light.
+        """
         from tofclip.camera.kernels import sample_bilinear, sample_delayed_rows, sample_rows
 
-        raw, shift = self._prepare(counts), np.float32(delay)
-        level = np.float32(estimate_dark_level(counts) if dark is None else dark)
-        measurements = np.empty_like(raw)
+        level, shift, measurements = np.float32(dark), np.float32(delay), np.empty_like(raw)
 
         def work(piece: slice) -> None:
             row, found = self._raw_row[piece], measurements[piece]
@@ -164,12 +174,8 @@ class Rectifier:
                 sample_bilinear(raw, level, row, column, shift, found)
 
         run_blocks(work, len(measurements), ROWS_PER_BLOCK)
-        # Zero, not their raw value: methods that take no mask must not see a stuck column as light.
         measurements[:, self._dead] = 0
-        # Some rows at a time: noise about the dark level is above it in the first ones already.
-        pieces = split_blocks(len(measurements), ROWS_PER_BLOCK)
-        require(any(measurements[piece].max() > 0 for piece in pieces), NO_LIGHT_MESSAGE)
-        return measurements.T
+        return measurements
 
     @cached_property
     def _runs(self) -> tuple[NDArray[np.uint64], IntArray]:
@@ -186,21 +192,6 @@ class Rectifier:
         last = np.where(np.append(row[1:], -1) == row, np.append(first[1:], 0), columns)
         runs = np.stack([first, last, top[row, first]], axis=1).astype(np.uint64)
         return runs, np.searchsorted(row, np.arange(rows + 1))
-
-    def _find_valid(self, bad: BoolArray, delay: float) -> BoolArray:
-        from tofclip.camera.kernels import mark_valid
-
-        valid, raw = np.empty(self._raw_row.shape, bool), np.ascontiguousarray(bad)
-
-        def work(piece: slice) -> None:
-            # one layout, whether each row has columns of its own or not: the loop is compiled once
-            column = np.ascontiguousarray(self._raw_column[piece])
-            mark_valid(raw, self._raw_row[piece], column, np.float32(delay), valid[piece])
-
-        run_blocks(work, len(valid), ROWS_PER_BLOCK)
-        # Dead columns are invalid at every instant, whatever the sensor shows there.
-        valid &= ~self.camera.dead_columns
-        return valid.T
 
     def _prepare(self, counts: Float32Array) -> Float32Array:
         """Return a streak image that fits as compiled loops take it."""
