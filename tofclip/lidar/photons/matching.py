@@ -28,6 +28,7 @@ TILE_PX = 16
 TILE_TABLES = 3  # of (tiles, coarse bins) float64 at once: counts, pooled sums, and a sorted copy
 MIN_TILE_SIGNIFICANCE = 5.0  # above the background, where a tile says that some surface lies there
 PIXELS_PER_BLOCK, ROWS_PER_BLOCK = 1 << 14, 16
+JUMP_COST_RATIO = 9.0  # a change by several labels costs this many times as much as one by one
 
 PLANE_ROUNDS = 5
 TRIAL_ROUNDS = 3  # of a reach that is tried, from the fit of the reach before
@@ -112,21 +113,16 @@ def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> Float
 
 
 def match_labels(
-    score: Float32Array,
-    axis: LabelAxis,
-    image_shape: tuple[int, int],
-    slope_cost: float,
-    jump_cost: float,
+    score: Float32Array, axis: LabelAxis, image_shape: tuple[int, int], slope_cost: float
 ) -> tuple[FloatArray, Float32Array]:
     """Find the most likely piecewise smooth surface, instants (rows, columns) in bins, and by how much
-    the label of each beats the next best that is not beside it. The costs are of a change by one
-    label, and by more.
+    the label of each beats the next best that is not beside it. The cost is of a change by one label.
     """
     from tofclip.lidar.photons import kernels
 
     cube = score.reshape(*image_shape, -1)
     total = np.zeros_like(cube)
-    costs = np.float32(slope_cost), np.float32(jump_cost)
+    costs = np.float32(slope_cost), np.float32(slope_cost * JUMP_COST_RATIO)
     kernels.add_path_scores(cube, *costs, total)
     kernels.add_path_scores(cube[::-1, ::-1], *costs, total[::-1, ::-1])
     label, margin = np.empty(score.shape[0], np.int64), np.empty(score.shape[0], np.float32)
@@ -140,6 +136,14 @@ def match_labels(
     # in the middle of labels
     surface = (axis.numbers[label] + 0.5) * axis.coarse - 0.5
     return surface.reshape(image_shape).astype(np.float64), margin.reshape(image_shape)
+
+
+def match_photons(
+    photons: PhotonImage, scene: Scene, axis: LabelAxis, slope_cost: float
+) -> tuple[FloatArray, Float32Array]:
+    """As `match_labels`, of the scores that photons give."""
+    score = compute_scores(photons, scene, axis)
+    return match_labels(score, axis, photons.image_shape, slope_cost)
 
 
 def fit_surface(

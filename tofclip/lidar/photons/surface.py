@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -23,13 +23,16 @@ from tofclip.errors import InputError
 from tofclip.lidar.photons.detector import PhotonDetector
 from tofclip.lidar.photons.image import PhotonImage, SurfaceImage, find_dim_pixels
 from tofclip.lidar.photons.matching import (
+    JUMP_COST_RATIO,
     PLANE_ROUNDS,
     TRIAL_ROUNDS,
+    LabelAxis,
     choose_label_axis,
     compute_scores,
     estimate_bias,
     fit_surface,
     match_labels,
+    match_photons,
 )
 from tofclip.lidar.photons.scene import (
     MIN_SHAPE_BINS,
@@ -65,7 +68,6 @@ EMPTY_POOL_PX, EMPTY_BACKGROUND_PX, EMPTY_ROUNDS = 3, 9, 30
 TINY = 1e-9
 MAX_JUDGED_PIXELS = 20_000  # evenly chosen, that the outlier probability is learnt from
 SLOPE_COSTS = (0.5, 2.0, 10.0)  # log-likelihood that a change by one label has to bring
-JUMP_COST_RATIO = 9.0  # any larger change costs this many times as much
 
 # How well it is known where in a response that was learnt from the scene its surface lies: one offset
 # for the whole picture, which `settings` state and no pixel's deviation holds.
@@ -137,19 +139,8 @@ def estimate_surface(
     train, test = photons.split(HELD_OUT_FRACTION, seed)
     training = scene.scale(1 - HELD_OUT_FRACTION)
     report(0.1)
-
-    volume = compute_scores(train, training, axis)
-    trials = []
-    for cost in SLOPE_COSTS:
-        surface, margin = match_labels(
-            volume, axis, train.image_shape, cost, cost * JUMP_COST_RATIO
-        )
-        evidence = float(weigh_evidence(test, train, training, surface).mean())
-        trials.append((evidence, cost, surface, margin))
-        report(0.1 + 0.1 * len(trials))
-    _, slope_cost, surface, margin = max(trials, key=lambda trial: trial[0])
-    costs = slope_cost, slope_cost * JUMP_COST_RATIO
-
+    slope_cost, surface, margin = choose_slope_cost(train, test, training, axis)
+    report(0.4)
     learnt = None
     if pulse is None or (learn and not photons.sampled):  # an instrument knows its gate
         learnt = learn_scene(train, test, training, surface, required=pulse is None)
@@ -157,10 +148,7 @@ def estimate_surface(
         scene = Scene(learnt, scene.background)
         require_plausible_pulse(photons, learnt.pulse)
         training = scene.scale(1 - HELD_OUT_FRACTION)
-        del volume  # before there is another one
-        volume = compute_scores(train, training, axis)
-        surface, margin = match_labels(volume, axis, train.image_shape, *costs)
-    del volume
+        surface, margin = match_photons(train, training, axis, slope_cost)
     report(0.6)
     if cycles is None and photons.shading is None:
         even = even_out_bins(counted, photons, surface[np.newaxis], scene.response.width)
@@ -171,53 +159,28 @@ def estimate_surface(
     empty = estimate_emptiness(test, train, training, fitted[..., 0])
     report(0.8)
 
-    def locate(photons: PhotonImage) -> FloatArray:
-        """Find the strongest surface, (rows, columns, 4): instant and deviation in bins, photons, and
-        probability of an outlier.
-        """
-        volume = compute_scores(photons, scene, axis)
-        surface, margin = match_labels(volume, axis, photons.image_shape, *costs)
-        del volume
-        # labels of a gate that is open for many steps are further off than its edges are steep
-        is_long = photons.sampled and scene.response.width > LONG_GATE_STEPS
-        rounds = LONG_GATE_ROUNDS if is_long else PLANE_ROUNDS
-        nested = fit_surface(photons, scene, surface, max(reach // 2, 1), rounds)
-        fitted = fit_surface(photons, scene, nested[..., 0], reach)
-        # Where no photon is near, or none on a slope of the response, the label is all there is.
-        counted = np.minimum(fitted[..., 1], scene.response.width * LABEL_SIGMA_WIDTHS)
-        bias = estimate_bias(fitted, nested, reach, scene.response.width)
-        sigma = np.sqrt(counted**2 + bias)
-        return np.stack([fitted[..., 0], sigma, fitted[..., 2], to_probability(margin)], -1)
-
-    layers, rest = [locate(photons)], photons
-    layers[0][..., 3] += (1 - layers[0][..., 3]) * empty
-    # A surface goes on where another one stops: behind an edge the second of a pixel may be found
-    # only when the third of the picture is looked for.
-    for _ in range(max_returns if max_returns > 1 else 0):
-        rest = remove_return(rest, scene, layers[-1])
-        if not rest.bin.size:
-            break
-        further = keep_significant(rest, scene, locate(rest))
-        if np.isnan(further).all():
-            break
-        layers.append(further)
-    stack = np.stack(layers)
-    strongest = np.argsort(-np.nan_to_num(stack[..., 2], nan=-1.0), axis=0, kind="stable")
-    stack = np.take_along_axis(stack, strongest[..., np.newaxis], axis=0)[:max_returns]
+    search = SurfaceSearch(scene, axis, slope_cost, reach, to_probability)
+    layers = search.find_layers(photons, empty, max_returns)
     missed = 0.0 if cycles is not None else find_missed_share(photons, scene, layers)
     if missed and len(layers) == 1:
         # light of a surface before it would be missing behind it as well
-        rest = remove_return(photons, scene, layers[0])
-        further = keep_significant(rest, scene, locate(rest))
-        missed = find_missed_share(photons, scene, [layers[0], further])
+        further = search.find_further(remove_return(photons, scene, layers[0]))
+        missed = find_missed_share(photons, scene, [*layers, further])
+    stack = np.stack(layers)
+    strongest = np.argsort(-np.nan_to_num(stack[..., 2], nan=-1.0), axis=0, kind="stable")
+    stack = np.take_along_axis(stack, strongest[..., np.newaxis], axis=0)[:max_returns]
     bin_m = SPEED_OF_LIGHT / 2 * photons.bin_width
+    stack = photons.add_bin_errors(stack * [bin_m, bin_m, 1, 1])
+    if photons.sampled:
+        detector = PhotonDetector(start, photons.bin_width, photons.bins).learn(photons)
+        stack = detector.add_step_errors(stack)
     common = LEARNT_RESPONSE_SIGMA_WIDTHS * scene.response.width if learnt is not None else 0.0
     settings: dict[str, float | str] = {
         "response": "given" if learnt is None else "learnt",
         "pulse_fwhm_ps": scene.response.pulse.fwhm * 1e12,
         "background_photons_per_bin": scene.background,
         "slope_cost": slope_cost,
-        "jump_cost": costs[1],
+        "jump_cost": slope_cost * JUMP_COST_RATIO,
         "reach_px": reach,
         "response_sigma_m": common * bin_m,
         "hot_pixels": int(hot.sum()),
@@ -225,11 +188,72 @@ def estimate_surface(
         "pile_up": missed,
         "uneven_bins_sigma_m": photons.bins_sigma_m,
     }
-    stack = photons.add_bin_errors(stack * [bin_m, bin_m, 1, 1])
-    if photons.sampled:
-        detector = PhotonDetector(start, photons.bin_width, photons.bins).learn(photons)
-        stack = detector.add_step_errors(stack)
     return SurfaceImage.from_layers(stack, scene.response.pulse, settings, hot)
+
+
+@dataclass(frozen=True)
+class SurfaceSearch:
+    """How a picture's surfaces are found, as photons that were held back have it."""
+
+    scene: Scene
+    axis: LabelAxis
+    slope_cost: float
+    reach: int  # of planes, px
+    to_probability: Callable[[Float32Array], FloatArray]  # of an outlier, from a label's margin
+
+    def locate(self, photons: PhotonImage) -> FloatArray:
+        """Find the strongest surface, (rows, columns, 4): instant and deviation in bins, photons, and
+        probability of an outlier.
+        """
+        scene, reach, width = self.scene, self.reach, self.scene.response.width
+        surface, margin = match_photons(photons, scene, self.axis, self.slope_cost)
+        # labels of a gate that is open for many steps are further off than its edges are steep
+        is_long = photons.sampled and width > LONG_GATE_STEPS
+        rounds = LONG_GATE_ROUNDS if is_long else PLANE_ROUNDS
+        nested = fit_surface(photons, scene, surface, max(reach // 2, 1), rounds)
+        fitted = fit_surface(photons, scene, nested[..., 0], reach)
+        # Where no photon is near, or none on a slope of the response, the label is all there is.
+        counted = np.minimum(fitted[..., 1], width * LABEL_SIGMA_WIDTHS)
+        sigma = np.sqrt(counted**2 + estimate_bias(fitted, nested, reach, width))
+        return np.stack([fitted[..., 0], sigma, fitted[..., 2], self.to_probability(margin)], -1)
+
+    def find_further(self, photons: PhotonImage) -> FloatArray:
+        """Find a surface in what nearer ones leave, NaN where the background alone explains it."""
+        return keep_significant(photons, self.scene, self.locate(photons))
+
+    def find_layers(
+        self, photons: PhotonImage, empty: FloatArray, max_returns: int
+    ) -> list[FloatArray]:
+        """Find the picture's surfaces, in the order in which they stand out; `empty`: how probable it
+        is that a pixel sends no light back.
+        """
+        layers = [self.locate(photons)]
+        layers[0][..., 3] += (1 - layers[0][..., 3]) * empty
+        # A surface goes on where another one stops: behind an edge the second of a pixel may be found
+        # only when the third of the picture is looked for.
+        for _ in range(max_returns if max_returns > 1 else 0):
+            photons = remove_return(photons, self.scene, layers[-1])
+            if not photons.bin.size:
+                break
+            further = self.find_further(photons)
+            if np.isnan(further).all():
+                break
+            layers.append(further)
+        return layers
+
+
+def choose_slope_cost(
+    train: PhotonImage, test: PhotonImage, scene: Scene, axis: LabelAxis
+) -> tuple[float, FloatArray, Float32Array]:
+    """Find the cost of a change by one label that explains the photons held back best, and what
+    `match_labels` gives with it.
+    """
+    score, trials = compute_scores(train, scene, axis), []
+    for cost in SLOPE_COSTS:
+        surface, margin = match_labels(score, axis, train.image_shape, cost)
+        evidence = float(weigh_evidence(test, train, scene, surface).mean())
+        trials.append((evidence, cost, surface, margin))
+    return max(trials, key=lambda trial: trial[0])[1:]
 
 
 def weigh_evidence(
