@@ -24,7 +24,7 @@ def take_shot(ranges, signal, seed):
 
 
 def find_returns(pipeline, shot):
-    return pipeline.search(pipeline.recover_shot(shot, pipeline.rectify(shot)))
+    return pipeline.search(pipeline.recover(pipeline.rectify(shot)))
 
 
 def compute_z(found, truth):

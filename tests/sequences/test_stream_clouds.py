@@ -77,7 +77,7 @@ def test_measurements_are_averaged_as_far_as_nothing_changes():
         for expected in [first.counts] * 7 + [last.counts]
     ]
     pipeline = make_pipeline(seen[0], average=4)
-    made = [pipeline.rectify(shot)[0].counts for shot in seen]
+    made = [pipeline.change(shot).counts for shot in seen]
     moved = dim * abs(last.counts - first.counts)
     lit = dim * first.counts > 5
     noise = [np.mean((one - dim * first.counts - 1)[lit] ** 2) for one in (seen[6].counts, made[6])]
@@ -230,7 +230,7 @@ def test_no_shot_is_no_cloud_and_faults_come_through():
 
 
 def follow(pipeline, shot):
-    return pipeline.search(pipeline.recover_shot(shot, pipeline.rectify(shot)))
+    return pipeline.search(pipeline.recover(pipeline.rectify(shot)))
 
 
 def test_light_that_is_clipped_in_a_later_shot_alone_changes_nothing(streaks):

@@ -147,9 +147,9 @@ class PhotonPipeline:
         require_shape("histograms", expected, shot.counts.shape)
         return shot.histograms
 
-    def recover_shot(self, shot: PhotonCube, rectified: Float32Array) -> BoolArray:
-        """Add the shots before it, pixel by pixel, as far as nothing has jumped."""
-        return self._sum.add(rectified)
+    def recover(self, histograms: Float32Array) -> BoolArray:
+        """Add a shot to those before it, pixel by pixel, as far as nothing has jumped."""
+        return self._sum.add(histograms)
 
     def search(self, still: BoolArray) -> Returns:
         """Find the returns of the sums where they are now; their intensity is that of one shot."""

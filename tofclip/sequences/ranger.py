@@ -194,10 +194,11 @@ class SurfacePipeline:
         """Prepare for shots like this one; see `RangingPipeline.for_shot`."""
         return cls(open_shot(shot, camera, time_zero).fit_camera(), method)
 
-    def rectify(self, shot: Streak) -> None:
+    def rectify(self, shot: Streak) -> Streak:
         """Do nothing: surfaces explain the raw image."""
+        return shot
 
-    def recover_shot(self, shot: Streak, rectified: None) -> SurfaceFit:
+    def recover(self, shot: Streak) -> SurfaceFit:
         """Fit the surfaces of a shot."""
         opened = replace(self._opened, streak=shot).merge_rows(self._rows_in_one)
         shot = opened.streak
@@ -219,12 +220,12 @@ class SurfacePipeline:
         if self._quick is None:
             camera = opened.camera.replace(range_calibration=None)
             self._quick = RangingPipeline(camera, shot.times, Sparse(), self._focus)
-        seen = self._quick.recover_shot(shot, self._quick.rectify(shot))
+        seen = self._quick.recover(self._quick.rectify(shot))
         assert isinstance(seen, PictureTraces)
         return self._quick.search(seen), seen.pictures.sum(axis=0)
 
     def search(self, found: SurfaceFit) -> Returns:
-        """List the returns of what `recover_shot` returned."""
+        """List the returns of what `recover` returned."""
         calibrated_px = self._opened.calibrated_px
         returns = keep_probable(list_returns(found, self.method.detection, calibrated_px))
         # a sweep is that of the shot's own rows
@@ -271,22 +272,20 @@ class ChangedPipeline:
         changes: Sequence[Callable[[Float32Array], Float32Array]],
         in_order: bool,
     ) -> None:
-        self._pipeline, self._changes, self.in_order = pipeline, changes, in_order
+        self._rectify, self._changes, self.in_order = pipeline.rectify, changes, in_order
         self.camera, self.method_name = pipeline.camera, pipeline.method_name
+        self.recover: Callable[[Any], Any] = pipeline.recover
+        self.search: Callable[[Any], Returns] = pipeline.search
 
-    def rectify(self, shot: Streak) -> tuple[Streak, Any]:
-        """Change a shot, and do what can be done before anything is recovered."""
+    def change(self, shot: Streak) -> Streak:
+        """Return a shot with the counts that are recovered."""
         for change in self._changes:
             shot = replace(shot, counts=change(shot.counts))
-        return shot, self._pipeline.rectify(shot)
+        return shot
 
-    def recover_shot(self, shot: Streak, rectified: tuple[Streak, Any]) -> Any:
-        """Do what the pipeline does with the changed shot."""
-        return self._pipeline.recover_shot(*rectified)
-
-    def search(self, found: Any) -> Returns:
-        """Find the returns in what `recover_shot` returned."""
-        return self._pipeline.search(found)
+    def rectify(self, shot: Streak) -> Any:
+        """Change a shot, and do what can be done before anything is recovered."""
+        return self._rectify(self.change(shot))
 
 
 class RangingPipeline:
@@ -366,9 +365,9 @@ class RangingPipeline:
         """Whether what comes out of a shot depends on those before it."""
         return self._warm_start is not None
 
-    def find_returns(self, measurements: Float32Array) -> Returns:
-        """Find the returns in one shot's rectified measurements, (columns, rows)."""
-        return self.search(self.recover(measurements))
+    def rectify(self, shot: Streak) -> Float32Array:
+        """Return a shot's measurements, (columns, rows)."""
+        return self.rectifier.rectify(shot.counts)
 
     def recover(self, measurements: Float32Array) -> Traces:
         """Do what a shot, (columns, rows), rectified, needs as a whole before its pixels are
@@ -383,17 +382,13 @@ class RangingPipeline:
             return self._warm_start.recover(held, bins)
         return _ShotTraces(self, held, bins)
 
-    def rectify(self, shot: Streak) -> Float32Array:
-        """Return a shot's measurements, (columns, rows)."""
-        return self.rectifier.rectify(shot.counts)
-
-    def recover_shot(self, shot: Streak, rectified: Float32Array) -> Traces:
-        """As `recover`."""
-        return self.recover(rectified)
-
     def search(self, found: Traces) -> Returns:
         """Find the returns in what `recover` returned."""
         return self._search.find_returns(found)
+
+    def find_returns(self, measurements: Float32Array) -> Returns:
+        """Find the returns in one shot's rectified measurements, (columns, rows)."""
+        return self.search(self.recover(measurements))
 
     def cloud(self, measurements: Float32Array) -> PointCloud:
         """Make the cloud of one shot's rectified measurements, (columns, rows)."""

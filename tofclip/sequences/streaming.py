@@ -57,14 +57,14 @@ class CloudPipeline(Protocol):
     def in_order(self) -> bool:
         """Whether what comes out of a shot depends on those before it."""
 
-    def rectify(self, shot: Any) -> Any:
-        """Do what can be done before anything is recovered; what comes out is for `recover_shot`."""
+    def rectify(self, shot: Any, /) -> Any:
+        """Do what can be done before anything is recovered; what comes out is for `recover`."""
 
-    def recover_shot(self, shot: Any, rectified: Any) -> Any:
-        """Do what a shot, `rectified` already, needs as a whole; what comes out is for `search`."""
+    def recover(self, rectified: Any, /) -> Any:
+        """Do what a shot needs as a whole; what comes out is for `search`."""
 
-    def search(self, found: Any) -> Returns:
-        """Find the returns in what `recover_shot` returned."""
+    def search(self, found: Any, /) -> Returns:
+        """Find the returns in what `recover` returned."""
 
 
 def make_pipeline(
@@ -396,7 +396,7 @@ def _make_cloud(
     ends = [perf_counter()]
     rectified = pipeline.rectify(shot)
     ends.append(perf_counter())
-    recovered = pipeline.recover_shot(shot, rectified)
+    recovered = pipeline.recover(rectified)
     ends.append(perf_counter())
     returns = pipeline.search(recovered)
     ends.append(perf_counter())
