@@ -207,6 +207,13 @@ def outline_streak(
     return Record(Streak.RECORD_KIND, fields, children=children)
 
 
+def number_returns(pixel: AnyArray) -> NDArray[np.uint8]:
+    """Return the number of each return in its pixel, from 1; `pixel` (n,) does not decrease."""
+    first = np.flatnonzero(np.diff(pixel, prepend=-1))
+    rank = np.arange(pixel.size) - np.repeat(first, np.diff(first, append=pixel.size))
+    return np.asarray(rank + 1, dtype=np.uint8)
+
+
 @dataclass(frozen=True)
 class Returns(Storable):
     """A list of returns, pixel by pixel in raster order, nearest first within a pixel.
@@ -301,6 +308,16 @@ class Returns(Storable):
     def __getitem__(self, chosen: AnyArray) -> Returns:
         """Return some of the returns, by a mask or by numbers."""
         return replace(self, **{name: column[chosen] for name, column in self._columns.items()})
+
+    def merge(self, others: Returns) -> Returns:
+        """Return these and others of the same camera, in order, each pixel's numbered anew."""
+        columns: dict[str, Any] = {
+            name: np.append(one, getattr(others, name)) for name, one in self._columns.items()
+        }
+        pixel = columns["y"].astype(np.int64) * self.camera.image_shape[1] + columns["x"]
+        order = np.lexsort((columns["range"], pixel))
+        columns["return_number"][order] = number_returns(pixel[order])
+        return replace(self, **columns)[order]
 
     def select(self, which: str) -> Returns:
         """Return one return of each pixel, or all of them; `which` is ``"first"``, the nearest of a

@@ -351,6 +351,16 @@ def test_one_return_of_each_pixel_is_chosen():
         returns.select("second")
 
 
+def test_returns_that_were_apart_are_merged_pixel_by_pixel():
+    returns = make_two_walls()
+    far = returns.range == 3
+    alone = replace(returns[far], return_number=np.ones(far.sum(), np.uint8))
+    whole = alone.merge(returns[~far])
+    for name in ("y", "x", "range", "intensity", "confidence", "return_number", "time"):
+        found, expected = getattr(whole, name), getattr(returns, name)
+        assert (found.tolist(), found.dtype) == (expected.tolist(), expected.dtype)
+
+
 @pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npz", ".csv"])
 def test_organised_clouds_have_a_place_for_every_pixel(open3d, tmp_path, suffix):
     returns, path = make_two_walls().select("first"), tmp_path / f"scene{suffix}"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from tofclip.camera import Camera, SkewSweep
-from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState
+from tofclip.recovery.surfaces.model import SurfaceModel
+from tofclip.recovery.surfaces.points import SurfaceState
 from tofclip.recovery.surfaces.shapes import SmoothBasis
 from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate

@@ -18,8 +18,9 @@ from tofclip.recovery.surfaces.fit import (
     find_usual_brightness,
     straighten_surfaces,
 )
-from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, weigh_measurements
+from tofclip.recovery.surfaces.model import SurfaceModel, weigh_measurements
 from tofclip.recovery.surfaces.patches import bend_patches, find_plain_patches
+from tofclip.recovery.surfaces.points import SurfaceState
 from tofclip.recovery.surfaces.pulse import ShotPulse, make_pulse, measure_pulse
 from tofclip.recovery.surfaces.ranges import (
     CLUSTER_COLUMNS,

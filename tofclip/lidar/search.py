@@ -31,7 +31,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofclip.arrays import Float32Array, FloatArray, IntArray, to_numpy
 from tofclip.camera import Camera
@@ -48,7 +47,7 @@ from tofclip.lidar.significance import (
     EvidenceJudge,
     join_candidates,
 )
-from tofclip.shots import Frames, Returns
+from tofclip.shots import Frames, Returns, number_returns
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -294,13 +293,6 @@ def depth(
         judge = EvidenceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
     traces = PictureTraces(to_numpy(frames.values), TraceBins.all_bins(frames.times.size))
     return search.find_returns(traces, frames.provenance, judge)
-
-
-def number_returns(pixel: IntArray) -> NDArray[np.uint8]:
-    """Return the number of each return in its pixel, from 1; `pixel` (n,) does not decrease."""
-    first = np.flatnonzero(np.diff(pixel, prepend=-1))
-    rank = np.arange(pixel.size) - np.repeat(first, np.diff(first, append=pixel.size))
-    return np.asarray(rank + 1, dtype=np.uint8)
 
 
 def keep_probable(returns: Returns, false_alarm: float | None = None) -> Returns:

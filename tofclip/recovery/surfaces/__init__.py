@@ -12,10 +12,11 @@ and the pulse h. With photon weights w the objective is
     J(a, r) = 1/2 |A(r) a - y|^2_w + sum_k weight_k TV(a_k) + 1/2 sum_k |bending of 1/z_k|^2.
 
 `patches` finds surfaces in the returns of a fast recovery of frames, `pulse` the shot's pulse;
-`model` is A(r) at a state of surfaces and camera, with its loops in `kernels`; `amplitudes` solves for
-a by FISTA, `ranges` for the state by Gauss-Newton steps. `recovery` is the method that `tofclip recover`
-runs: `start` lays surfaces out or refuses the shot, `fit` has the order of all steps, `returns` lists
-what was found. docs/recovery_algorithm.md derives it.
+`points` says where surfaces are and their light falls, `model` is A(r) at a state of surfaces and
+camera, with its loops in `kernels`; `amplitudes` solves for a by FISTA, `ranges` for the state by
+Gauss-Newton steps. `recovery` is the method that `tofclip recover` runs: `start` lays surfaces out or
+refuses the shot, `fit` has the order of all steps, `returns` lists what was found.
+docs/recovery_algorithm.md derives it.
 """
 
 from tofclip.recovery.surfaces.recovery import SurfaceRecovery

@@ -18,7 +18,6 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.lidar.search import number_returns
 from tofclip.recovery.surfaces.shapes import (
     SPLINE_DEGREE,
     TINY,
@@ -26,7 +25,7 @@ from tofclip.recovery.surfaces.shapes import (
     SmoothBasis,
     fit_quadric,
 )
-from tofclip.shots import Returns
+from tofclip.shots import Returns, number_returns
 
 MARGIN_PX = 10  # how far a surface may reach beyond the returns that showed it
 NEIGHBOUR_BINS = 1.6  # neighbouring pixels whose ranges differ by less lie on one surface

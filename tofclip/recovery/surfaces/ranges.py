@@ -27,7 +27,8 @@ from tofclip.recovery.surfaces.amplitudes import (
     scale_amplitude,
     share_misfit,
 )
-from tofclip.recovery.surfaces.model import SurfaceModel, SurfaceState, Window
+from tofclip.recovery.surfaces.model import SurfaceModel, Window
+from tofclip.recovery.surfaces.points import SurfaceState
 from tofclip.recovery.surfaces.pulse import TINY, Image, differentiate_pulse
 from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, Pixels, QuadricBasis
 from tofclip.units import SPEED_OF_LIGHT

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import scipy
@@ -13,7 +13,6 @@ from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.lidar import Detection
 from tofclip.lidar.range_calibration import correct_returns
-from tofclip.lidar.search import number_returns
 from tofclip.recovery.surfaces.amplitudes import NEIGHBOURHOOD_PX, share_misfit
 from tofclip.recovery.surfaces.fit import (
     NEAR_BINS,
@@ -91,29 +90,18 @@ def list_returns(
     hidden = estimate_hidden_shift(model, amplitude)
     parts = np.stack([fitted, fit.remainder[model.surface], *moved, bent, rounded, hidden])
     deviation = np.sqrt(np.sum(parts**2, axis=0) + model.estimate_sweep_error() ** 2)
-    columns: dict[str, Any] = {
-        "y": y,
-        "x": x,
-        "range": distance[chosen],
-        "intensity": intensity[chosen],
-        "confidence": deviation[chosen],
-        "time": time[chosen],
-        "false_alarm": doubt[strong],
-    }
-    for name, column in columns.items():
-        beside = getattr(others, name)
-        columns[name] = np.concatenate([column.astype(beside.dtype), beside])
-    pixel = columns["y"].astype(np.intp) * camera.image_shape[1] + columns["x"]
-    order = np.lexsort((columns["range"], pixel))
-    columns = {name: column[order] for name, column in columns.items()}
-    return correct_returns(
-        Returns(
-            **columns,
-            return_number=number_returns(pixel[order]),
-            camera=camera,
-            shear=np.asarray(camera.shear_at(columns["range"])),
-        )
-    )
+    found = Returns(
+        y=y.astype(np.int32),
+        x=x.astype(np.int32),
+        range=distance[chosen],
+        intensity=intensity[chosen].astype(np.float32),
+        confidence=deviation[chosen].astype(np.float32),
+        return_number=np.ones(y.size, np.uint8),
+        time=time[chosen],
+        camera=camera,
+        false_alarm=doubt[strong],
+    ).merge(others)
+    return correct_returns(replace(found, shear=np.asarray(camera.shear_at(found.range))))
 
 
 def estimate_hidden_shift(model: SurfaceModel, amplitude: Image) -> FloatArray:

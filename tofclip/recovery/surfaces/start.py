@@ -4,8 +4,7 @@ picture. What is no shot of surfaces (smoke, light in flight, relay walls) is re
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -17,12 +16,7 @@ from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar import compute_ray_directions, depth
 from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver
-from tofclip.recovery.surfaces.model import (
-    SMOOTHING_PX,
-    SurfaceModel,
-    SurfaceState,
-    compare_smoothed,
-)
+from tofclip.recovery.surfaces.model import SMOOTHING_PX, SurfaceModel, compare_smoothed
 from tofclip.recovery.surfaces.patches import (
     MARGIN_PX,
     Patch,
@@ -32,6 +26,7 @@ from tofclip.recovery.surfaces.patches import (
     find_plain_patches,
     reach_further,
 )
+from tofclip.recovery.surfaces.points import SurfaceState
 from tofclip.recovery.surfaces.pulse import Image, ShotPulse
 from tofclip.recovery.surfaces.shapes import Pixels
 from tofclip.shots import Frames, Returns, Streak
@@ -104,12 +99,7 @@ def _add_pooled(shown: Returns, frames: Frames, ray_length: FloatArray, bin_m: f
     found = _leave_out_doubtful(found, ray_length, bin_m)
     alone = np.zeros(ray_length.shape, bool)
     alone[shown.y, shown.x] = True
-    found = found[~alone[found.y, found.x]]
-    columns = (one.name for one in fields(Returns) if one.name not in ("camera", "provenance"))
-    both: dict[str, Any] = {
-        name: np.append(getattr(shown, name), getattr(found, name)) for name in columns
-    }
-    return replace(shown, **both)
+    return shown.merge(found[~alone[found.y, found.x]])
 
 
 def measure_rays(camera: Camera) -> FloatArray:
