@@ -188,9 +188,14 @@ def estimate_displacement(camera: Camera, calibrated_px: FloatArray) -> FloatArr
     down, px; `camera`: with those that a shot shows.
 
     Of errors e_v a shot shows all but what looks like a displaced picture, ``e_v = dx - dy
-    tan(angle_v)``. They are taken to be independent: what is shown says how large they are.
+    tan(angle_v)``. They are taken to be independent: what is shown says how large they are, the less
+    surely the fewer views there are, of which Student's distribution keeps account, and no less than
+    the calibration says of itself.
     """
     looks = np.stack([np.ones(camera.views), -np.tan(camera.angles)], axis=1)
     freedom = max(camera.views - looks.shape[1], 1)
-    error_px = np.linalg.norm(camera.centres_px - calibrated_px) / np.sqrt(freedom)
+    shown_px = np.linalg.norm(camera.centres_px - calibrated_px) / np.sqrt(freedom)
+    shown_px *= scipy.special.stdtrit(freedom, 0.75) / scipy.special.ndtri(0.75)
+    stated_px = np.sqrt(np.mean(np.nan_to_num(camera.centre_uncertainty_px) ** 2))
+    error_px = max(shown_px, stated_px)
     return np.asarray(error_px * np.linalg.norm(np.linalg.pinv(looks), axis=1))
