@@ -35,7 +35,7 @@ from tofclip.simulate.bodies import (
     spread_pulse,
 )
 from tofclip.storage import collect_provenance
-from tofclip.units import FWHM_PER_SIGMA, SPEED_OF_LIGHT
+from tofclip.units import FWHM_PER_SIGMA, MAD_TO_SIGMA, SPEED_OF_LIGHT
 
 
 def make_plate(
@@ -385,9 +385,6 @@ def render_true_frames(
     return Frames(values, times, camera, shears=camera.shear_at(distances))
 
 
-MEDIAN_PER_SIGMA = 0.6745  # of the absolute value of a normal variate, in its deviation
-
-
 def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
     """Compare each target pixel's most intense return with the true range.
 
@@ -428,7 +425,7 @@ def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
         "share_within_one_bin": float(np.mean(error <= bin_m)),
         "share_with_return": float(np.mean(found)),
         "false_return_share": float(np.mean(~near_anything[returns.y, returns.x])),
-        "range_z": float(np.median(ratio) / MEDIAN_PER_SIGMA),
+        "range_z": float(MAD_TO_SIGMA * np.median(ratio)),
         "bin_m": bin_m,
     }
 
