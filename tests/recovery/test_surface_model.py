@@ -627,7 +627,7 @@ def test_what_a_shot_shows_of_centres_says_how_far_the_rest_displaces_the_pictur
 
 
 def test_a_pulse_is_measured_alike_whatever_it_was_taken_for():
-    """So what seemed a tail, as first ranges were off, is taken back once they are right."""
+    """So what seemed a tail, as first ranges were off, may go once they are right."""
     model = make_model(simulate_shot(SCENE, INSTRUMENT, seed=0).streak)
     amplitude = np.full(model.surface.size, 500, np.float32)
     late = ShotPulse(model.pulse.sigma, np.array([0, 9]), np.array([0.7, 0.3]))

@@ -158,10 +158,10 @@ def _fit_returns(
     refinement, remainder = _refine(solver, begun, tick)
     if solver.model.pulse.reach:
         # what seemed a tail may have been ranges that were off
-        again = _measure_pulse(solver)
-        if not again.model.pulse.reach:
-            solver = again
-            refinement, remainder = _refine(solver, refinement, tick)
+        plain = _measure_pulse(solver, np.inf)
+        further = _refine(plain, refinement, tick)
+        if _measure_misfit(plain) < _measure_misfit(solver):
+            solver, (refinement, remainder) = plain, further
     # dim light has given way a little by now
     sparse = _explain_sparsely(solver.model, solver, weight, SPARSELY)
     solver.run(iterations, tick)
@@ -170,11 +170,11 @@ def _fit_returns(
     return SurfaceFit(solver, sparse, refinement, remainder, reference, *beside, found)
 
 
-def _measure_pulse(solver: AmplitudeSolver) -> AmplitudeSolver:
-    """Give surfaces the pulse that the shot shows."""
+def _measure_pulse(solver: AmplitudeSolver, least_tail: float = LEAST_TAIL) -> AmplitudeSolver:
+    """Give surfaces the pulse that the shot shows, without a tail of less than a part of the light."""
     model, light = solver.model, solver.model.render_instants(solver.amplitude)
     width = model.camera.pulse_fwhm / model.bin_width
-    least_tail = max(LEAST_TAIL, LEAST_EXPLAINED * model.unexplained(solver.amplitude))
+    least_tail = max(least_tail, LEAST_EXPLAINED * model.unexplained(solver.amplitude))
     pulse = measure_pulse(light, model.image, model.weights, width, least_tail)
     require_pulse(pulse)
     if (pulse.sigma, pulse.reach) == (model.pulse.sigma, model.pulse.reach):
