@@ -169,15 +169,16 @@ def iterate_members(
 
 
 def require_bounded_dataset(
-    dataset: h5py.Dataset, origin: str | Path, at_once: int | None = None
+    dataset: h5py.Dataset, origin: str | Path, at_once: int | None = None, objects: bool = False
 ) -> None:
     """Refuse a dataset whose values are not in its own file, or claim more than the file can hold.
-    `at_once`: how many of its values are read at once; by default all.
+    `at_once`: how many of its values are read at once; by default all. `objects`: values may be
+    references.
     """
     name, dtype = dataset.name.lstrip("/"), dataset.dtype
     if dataset.is_virtual or dataset.external:
         raise FileFormatError(origin, f"'{name}' lies in other files, which are not read")
-    if dtype.hasobject or dataset.shape is None:
+    if (dtype.hasobject and not objects) or dataset.shape is None:
         raise FileFormatError(origin, f"'{name}' does not hold numbers of a fixed size")
     claimed = math.prod(dataset.shape) * dtype.itemsize
     wanted = claimed if at_once is None else at_once * dtype.itemsize

@@ -283,6 +283,15 @@ def test_pages_in_a_circle_are_refused(tmp_path):
     refuse(path, "in a circle", describe_photons)
 
 
+def test_a_chunk_that_is_larger_than_its_cube_is_refused(tmp_path):
+    """A file of a megabyte had a gigabyte unpacked for a few bins."""
+    path, chunk = tmp_path / "chunk.h5", (1, 1, 1 << 25)
+    with h5py.File(path, "w") as file:
+        cube = file.create_dataset("counts", (4, 5, 64), "u4", maxshape=(None,) * 3, chunks=chunk)
+        cube.id.write_direct_chunk((0, 0, 0), bytes(64))
+    refuse(path, "a chunk of 'counts' claims 134217728 bytes")
+
+
 def test_links_out_of_a_file_are_not_followed(counts, tmp_path):
     write_hdf5(tmp_path / "a.h5", counts)
     with h5py.File(tmp_path / "link.h5", "w") as file:

@@ -24,6 +24,7 @@ from tofclip.files import (
     guard,
     import_file_reader,
     iterate_members,
+    require_bounded_dataset,
     require_bounded_size,
     translate_read_errors,
 )
@@ -343,12 +344,12 @@ def _open_hdf5(path: Path) -> _PhotonFile:
         for name, dataset in _iterate_datasets(file, set()):
             scalars.update(dataset.attrs)
             is_cell = dataset.dtype.kind == "O" and dataset.attrs.get("MATLAB_class") == b"cell"
-            if dataset.size == 1 and dataset.dtype.kind in "uif":
+            if dataset.shape is None or not (is_cell or dataset.dtype.kind in "uif"):
+                continue
+            require_bounded_dataset(dataset, path, objects=is_cell)
+            if dataset.size == 1 and not is_cell:
                 scalars[name.rpartition("/")[2]] = dataset[()]
-            elif dataset.shape and (is_cell or dataset.dtype.kind in "uif"):
-                size = dataset.size * dataset.dtype.itemsize
-                held, packed = dataset.id.get_storage_size(), bool(dataset.chunks)
-                require_bounded_size(path, name, size, held, packed)
+            elif dataset.shape:
                 # MATLAB counts its axes from the other end.
                 matlab = "MATLAB_class" in dataset.attrs
                 shape = dataset.shape[::-1] if matlab else dataset.shape
@@ -380,6 +381,7 @@ def _load_dataset(path: Path, name: str, matlab: bool) -> AnyArray:
             total, cells = 0, np.empty(values.shape, dtype=object)
             for place in np.ndindex(values.shape):
                 cell = file[values[place]]
+                require_bounded_dataset(cell, path)
                 total += cell.size * cell.dtype.itemsize
                 require_bounded_size(path, name, total, path.stat().st_size, True)
                 empty = bool(cell.attrs.get("MATLAB_empty", 0))
