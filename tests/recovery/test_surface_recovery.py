@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 from surface_scene import BIN, BIN_M, CAMERA, CENTRES, INSTRUMENT, SCENE, SHAPE, place
 
 from tofclip import depth, nmse, point_cloud, recover
@@ -65,6 +66,16 @@ def test_frames_are_the_rendering_of_the_returns_and_keep_them(found, tmp_path: 
     # numbers are those of the points that are left
     pixel = returns.y.astype(int) * 48 + returns.x
     assert np.array_equal(returns.return_number == 1, np.diff(pixel, prepend=-1) > 0)
+
+
+def test_light_that_surfaces_do_not_explain_is_told(shot, found):
+    """As of light that was reflected twice, which comes late and spread over time."""
+    late = scipy.ndimage.gaussian_filter(np.roll(shot.signal, (30, 33), (0, 1)), 12)
+    counts = shot.streak.counts + np.random.default_rng(0).poisson(np.maximum(late, 0))
+    spoilt = replace(shot.streak, counts=counts.astype(np.float32))
+    told = recover(spoilt, shot.camera, "surfaces").figures
+    assert told["unexplained_light"] > 0.1
+    assert "unexplained_light" not in found.figures
 
 
 def test_without_noise_a_plate_is_where_it_is():

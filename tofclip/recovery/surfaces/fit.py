@@ -159,7 +159,7 @@ def _fit_returns(
     if solver.model.pulse.reach:
         # what seemed a tail may have been ranges that were off
         plain = _measure_pulse(solver, np.inf)
-        further = _refine(plain, refinement, tick)
+        further = _refine(plain, refinement)
         if _measure_misfit(plain) < _measure_misfit(solver):
             solver, (refinement, remainder) = plain, further
     # dim light has given way a little by now
@@ -383,7 +383,7 @@ def straighten_surfaces(
 
 
 def _refine(
-    solver: AmplitudeSolver, found: Refinement | None, tick: Tick
+    solver: AmplitudeSolver, found: Refinement | None, tick: Tick = lambda: None
 ) -> tuple[Refinement, FloatArray]:
     """Steps on ranges and instrument until they hardly move; the last one, and what more would
     change of each surface.
