@@ -29,7 +29,7 @@ PLACE_PX, BESIDE_PX, DIM_PART, REWEIGHT_ITERATIONS = 3, 15, 0.75, 10
 CAPPED_COST = 0.5
 # Deviations of a pixel's noise: iterations that change each surface by less, root mean square, are enough
 SETTLED_SIGMAS = 0.003
-MISFIT_PX = 13  # side of the square about a measurement, by whose misfit it is judged
+MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 
 Tick = Callable[[], object]
@@ -82,9 +82,8 @@ class AmplitudeSolver:
         model = self.model
         rest = model.weights * (model.image - model.render(self.amplitude)) ** 2
         valid = (model.weights > 0).astype(np.float32)
-        around, seen = (scipy.ndimage.uniform_filter(one, MISFIT_PX) for one in (rest, valid))
-        around /= np.maximum(seen, np.float32(MISFIT_PX**-2))
-        return np.asarray(np.maximum(around, np.float32(self.variance)))
+        around, seen = (scipy.ndimage.gaussian_filter(one, MISFIT_PX) for one in (rest, valid))
+        return np.asarray(np.maximum(around / np.maximum(seen, TINY), np.float32(self.variance)))
 
     def measure_significance(self, variance: Image | None = None) -> Image:
         """By how many standard deviations each point's amplitude is above nothing, (points,). A pixel
