@@ -324,7 +324,7 @@ class SurfaceModel(SurfacePoints):
                 kernel = self.pulse.extend(self.make_kernel(view, variance=0.0)) ** 2
                 slit_shares = slit_shares**2
                 lags = np.arange(kernel.size) - kernel.size // 2
-                shares = shares**2 * self.places.overlap / self.places.share
+                shares = shares**2 * self.places.overlap
             light = np.zeros((1, *place.shape), np.float32)
             below = place.first_row - above
             lines = -lags, place.reached_rows, below, place.first_column
@@ -345,4 +345,4 @@ class SurfaceModel(SurfacePoints):
         shading[:, self.outer] *= np.maximum(1 + self.state.borders * self.excess, 0)
         self._shades = shading.astype(np.float32)
         shading *= self.state.gains[:, np.newaxis]
-        self._shares = (shading * self.places.share).astype(np.float32)
+        self._shares = shading.astype(np.float32)

@@ -31,7 +31,12 @@ from tofclip.recovery.surfaces.pulse import (
     Image,
     ShotPulse,
 )
-from tofclip.recovery.surfaces.shapes import KnownBasis, SmoothBasis, evaluate_monomials
+from tofclip.recovery.surfaces.shapes import (
+    KnownBasis,
+    QuadricBasis,
+    SmoothBasis,
+    evaluate_monomials,
+)
 from tofclip.shots import Streak
 from tofclip.threads import map_parallel, split_blocks, thread_count
 from tofclip.units import SPEED_OF_LIGHT
@@ -94,7 +99,7 @@ class Places(NamedTuple):
     offset: FloatArray  # (2, places), from the pixel's middle along columns and rows, px
     size: FloatArray  # (2, places), along columns and rows, px
     distance: FloatArray  # (places,), m
-    share: Image  # (points,), of a point's light that each of its places has
+    share: Image  # (places,), of its point's light
     # (points,), sum of squares of what parts have in common, over that of the pulse alone
     overlap: Image
 
@@ -122,8 +127,22 @@ class Places(NamedTuple):
         away = np.sum(offset * (slopes / filled)[:, point], axis=0)
         ramp = np.hypot(*slopes) / row_m / pulse_rows  # pulses that a pixel spans
         overlap = (1 / np.sqrt(1 + ramp**2 / 6)).astype(np.float32)
-        share = (1 / total).astype(np.float32)
+        share = (1 / total[point]).astype(np.float32)
         return cls(point, starts, offset, size, distance[point] + away, share, overlap)
+
+    def choose(self, distance: FloatArray, light: FloatArray) -> Places:
+        """Return those that have light, (places,), at such distances."""
+        kept = light > 0
+        point = self.point[kept]
+        share = light[kept] / np.bincount(point, light[kept])[point]
+        return self._replace(
+            point=point,
+            starts=np.concatenate([[0], np.cumsum(np.bincount(point))]),
+            offset=self.offset[:, kept],
+            size=self.size[:, kept],
+            distance=distance[kept],
+            share=share.astype(np.float32),
+        )
 
 
 class Footprint(NamedTuple):
@@ -255,6 +274,7 @@ class SurfacePoints:
         self.places = Places.split(
             self.distance, self.compute_slopes(), self.aside, self.pulse.sigma, self.row_m
         )
+        self._follow_limbs()
         # (views, outer points), the fraction by which each view sees more or less of a point in the
         # picture's outer columns than the reference view, if its picture ends where its own does
         depth = self.distance[self.outer] / self.ray_length[self.outer]
@@ -271,10 +291,42 @@ class SurfacePoints:
         )
         self.footprints = list(itertools.chain.from_iterable(spread))
 
+    def _follow_limbs(self) -> None:
+        """Put parts of pixels where surfaces of second order are, as bright as they face the camera, and leave
+        out those beyond a limb: there a pixel spans so much range that no line follows it. A point is where
+        all that is left of it is on average.
+        """
+        places, axis, size = self.places, self.camera.optical_axis_px, self.distance.size
+        # of each point, how much of its light turning away leaves, and whether its surface ends in it
+        self.facing, self.at_limb = np.ones(size), np.zeros(size, bool)
+        curved = {k: one for k, one in enumerate(self.bases) if isinstance(one, QuadricBasis)}
+        if not curved:
+            return
+        distance, light = places.distance.copy(), np.ones(places.point.size)
+        for surface, basis in curved.items():
+            part, coefficients = self.parts[surface], self.state.coefficients[surface]
+            own = slice(int(places.starts[part.start]), int(places.starts[part.stop]))
+            point, offset = places.point[own], places.offset[:, own]
+            inverse, slope, inside = basis.look_between(self.pixel[point], offset, coefficients)
+            inverse = np.maximum(inverse, MIN_INVERSE_DEPTH)
+            there = np.bincount(point - part.start, inside)[point - part.start] > 0
+            x, y = self._x[point] + offset[0], self._y[point] + offset[1]
+            ways = compute_ray_directions(self.camera, y + axis[0], x + axis[1])
+            distance[own] = np.where(there, 1 / ways[:, 2] / inverse, distance[own])
+            facing = 1 / np.hypot(1, self.camera.focal_length_px * slope / inverse)
+            light[own] = np.where(there, facing * inside, 1)
+        self.places = places.choose(distance, light)
+        before, left = np.diff(places.starts), np.diff(self.places.starts)
+        self.facing, self.at_limb = np.bincount(places.point, light) / before, left < before
+        mean = np.bincount(self.places.point, self.places.distance) / left
+        self.distance = np.where(np.isin(self.surface, list(curved)), mean, self.distance)
+
     def fill_partly(self, amplitude: Image) -> None:
         """Put the light of pixels that a surface fills in part on the side of the brighter of the pixels
-        beside them: as much as is missing from what these, going on as they do, would make it.
+        beside them: as much as is missing from what these, going on as they do, would make it, if all
+        faced the camera.
         """
+        amplitude = (amplitude / self.facing).astype(np.float32)
         beyond = np.take_along_axis(self.beside, self.beside, axis=-1)
         before, behind = self.find_light_beside(amplitude).swapaxes(0, 1)
         ahead, after = amplitude[beyond].swapaxes(0, 1)
@@ -287,6 +339,7 @@ class SurfacePoints:
             (1 - np.maximum(part, LEAST_FILLED)) / 2 * (light - dark) / np.maximum(amplitude, TINY)
         )
         self.aside = np.where(behind > before, away, -away).astype(np.float64)
+        self.aside[:, self.at_limb] = 0
         self.place(self.state)
 
     def find_light_beside(self, amplitude: Image) -> Image:
@@ -343,6 +396,7 @@ class SurfacePoints:
         away, last = margin + samples, rows + margin - samples
         first, shares = kernels.split_between_rows(np.clip(row, -away, rows + away))
         dark = (first <= -margin) | (first >= last)
+        shares *= self.places.share[:, np.newaxis]
         shares[dark] = 0
         seen = first[~dark]  # the others are among these
         np.clip(first, seen.min(initial=last), seen.max(initial=-margin), out=first)

@@ -135,7 +135,9 @@ class QuadricBasis(SmoothBasis):
 
     def evaluate(self, pixels: Pixels) -> FloatArray:
         """Return the monomials at some pixels, (pixels, 6)."""
-        row, column = np.divmod(pixels, self.image_shape[1])
+        return self._stack(*np.divmod(pixels, self.image_shape[1]))
+
+    def _stack(self, row: NDArray[Any], column: NDArray[Any]) -> FloatArray:
         (top, left), (high, wide) = self.box[:2], self._measure_box()
         x, y = 2 * (column - left + 0.5) / wide - 1, 2 * (row - top + 0.5) / high - 1
         return _stack_monomials(x, y)
@@ -184,6 +186,26 @@ class QuadricBasis(SmoothBasis):
             max_nfev=FIT_STEPS,
         )
         return np.asarray(found.x)
+
+    def look_between(
+        self, pixels: Pixels, offset: FloatArray, coefficients: FloatArray
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Return inverse depths beside the middles of pixels, (n,), by `offset`, (2, n), px to the right and
+        down, with nothing rounded off; by how much they change from pixel to pixel; and which are within
+        the limb.
+        """
+        row, column = np.divmod(pixels, self.image_shape[1])
+        functions = self._stack(row + offset[1], column + offset[0])
+        linear, own = coefficients[:LINEAR], coefficients[LINEAR:]
+        q = 2 * self.unit * (functions @ own)
+        inside = q > 0
+        root = np.sqrt(np.where(inside, q, 1.0))
+        steepness = [
+            2 / side * (linear[one] + self.sign * self.unit * (functions @ (way @ own)) / root)
+            for one, side, way in zip((1, 2), self._measure_box()[::-1], (BY_X, BY_Y), strict=True)
+        ]
+        inverse = functions[:, :LINEAR] @ linear + self.sign * np.where(inside, root, 0)
+        return inverse, np.hypot(*steepness), inside
 
     def _round_off(self, functions: FloatArray, coefficients: FloatArray) -> tuple[Any, ...]:
         """Twice the square of the root, which is q inside and rounded off at the limb; its size there;
