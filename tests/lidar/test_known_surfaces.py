@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from physics_scenes import make_person, make_shot, plate
+from physics_scenes import make_person, make_shot, plate, sphere
 
 import tofclip
 from tofclip.errors import InputError
@@ -95,6 +95,27 @@ def test_a_person_is_round():
     assert score["medians_mm"]["head"] < 0.8
     assert score["medians_mm"]["torso"] < 0.5
     assert score["medians_mm"]["limb"] < 0.5
+
+
+def test_a_ball_is_round_to_its_limb():
+    """A pixel at the limb spans a dozen bins of range, of which the near ones are bright: with a line's course
+    and even light in it all of a ball of 11 px gave way. Seeds 1 to 3 were 1.8, 1.3 and 2.2 mm off, root
+    mean square, 2.2 to 2.3 times what they said; now 0.7, 0.6 and 1.5 mm, and 0.8 to 0.9.
+    """
+    things = [
+        sphere("ball", (0.1, 0.1, 2.6), 0.1, 0.6),
+        plate("wall", (0, 0, 3.9), (4, 4), 0.45),
+    ]
+    shot = make_shot(things, seed=1, size=64)
+    frames, score = recover_shot(shot, shot.camera)
+    row, column, distance, number, fill = shot.truth.T
+    truth, whole = np.full((64, 64), np.nan), (number == 0) & (fill > 0.99)
+    truth[row[whole].astype(int), column[whole].astype(int)] = distance[whole]
+    off = frames.returns.range - truth[frames.returns.y, frames.returns.x]
+    near = np.abs(off) < 0.03
+    assert np.count_nonzero(near) > 75
+    assert np.sqrt(np.mean(off[near] ** 2)) < 1.2e-3
+    assert 0.5 < score["z"]["ball"] < 1.7
 
 
 @pytest.mark.nightly

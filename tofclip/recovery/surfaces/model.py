@@ -338,9 +338,7 @@ class SurfaceModel(SurfacePoints):
         return np.asarray(amplitude * self._shades[view], np.float32)
 
     def _find_shades(self) -> None:
-        """How bright each view sees each point, (views, points), beside its amplitude; and how much light
-        it has of each of the point's places.
-        """
+        """How bright each view sees each point, (views, points), beside its amplitude, and as its gain has it."""
         shading = np.exp(np.where(self.behind, self.state.shading.T[:, self.surface], 0))
         shading[:, self.outer] *= np.maximum(1 + self.state.borders * self.excess, 0)
         self._shades = shading.astype(np.float32)
