@@ -15,9 +15,8 @@ from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import TINY, Image
 
 PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
-# At least, unless norms are known, and at most, until they grow by as little: where many surfaces share
-# measurements it takes long
-NORM_ITERATIONS, MOST_NORM_ITERATIONS, SETTLED_NORM = 10, 40, 0.02
+# At least and at most, until norms change by as little: where many surfaces share measurements it takes long
+NORM_ITERATIONS, FURTHER_NORM_ITERATIONS, MOST_NORM_ITERATIONS, SETTLED_NORM = 10, 2, 40, 0.02
 NORM_MARGIN = 1.1
 EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
@@ -58,20 +57,19 @@ class AmplitudeSolver:
         boxes = (scipy.ndimage.find_objects(mask) for mask in model.masks.astype(np.int8))
         self._boxes = [next(iter(box), (slice(0, 1), slice(0, 1))) for box in boxes]
         self._direction = np.ones(model.surface.size, np.float32)
-        self._norms, self._fresh = np.zeros(len(model.masks)), True
+        self._fresh = True
         self.variance = 1.0
         if earlier is not None:
             self._dual, self._direction = earlier._dual.copy(), earlier._direction
-            self._norms, self._fresh, self.variance = earlier._norms, False, earlier.variance
+            self._fresh, self.variance = False, earlier.variance
 
     def cover(self, masks: NDArray[np.bool_]) -> AmplitudeSolver:
         """Return the same for surfaces that lie only, or also, where their masks are."""
         left = masks.any(axis=(1, 2))
         pictures, directions = np.zeros((2, *masks.shape), np.float32)
         pictures[self.model.masks], directions[self.model.masks] = self.amplitude, self._direction
-        other = AmplitudeSolver(self.model.cover(masks), pictures[masks], self.weight)
+        other = AmplitudeSolver(self.model.cover(masks), pictures[masks], self.weight, self)
         other._dual, other._direction = self._dual[left], directions[masks]
-        other._fresh, other.variance = False, self.variance
         return other
 
     def estimate_local_variance(self) -> Image:
@@ -184,17 +182,18 @@ class AmplitudeSolver:
 
     def _estimate_norms(self) -> FloatArray:
         """Largest eigenvalue of A'WA for each surface, by power iteration."""
-        model, vector, norms = self.model, self._direction, self._norms
+        model, count = self.model, len(self.model.masks)
+        vector, norms = self._direction, np.ones(count)
         # the vector of the last time is nearly the one of moved surfaces
-        least = NORM_ITERATIONS if self._fresh else 1
+        least = NORM_ITERATIONS if self._fresh else FURTHER_NORM_ITERATIONS
         for number in range(MOST_NORM_ITERATIONS):
             vector, before = model.pull(vector), norms
-            norms = np.sqrt(np.bincount(model.surface, vector.astype(np.float64) ** 2, norms.size))
+            norms = np.sqrt(np.bincount(model.surface, vector.astype(np.float64) ** 2, count))
             norms = np.maximum(norms, 1e-3 * norms.max())
             vector /= norms[model.surface].astype(np.float32)
             if number + 1 >= least and np.all(norms < (1 + SETTLED_NORM) * before):
                 break
-        self._direction, self._norms, self._fresh = vector, norms, False
+        self._direction, self._fresh = vector, False
         return norms
 
     def _shrink(self, amplitude: Image, weights: FloatArray) -> Image:
