@@ -48,9 +48,9 @@ MAX_UNEXPLAINED = 0.4
 # Of what frames leave unexplained, and of what surfaces left in the shot before: from there on the
 # surfaces are not the shot's.
 CHANGED_RATIO = 1.25
-# Of a pulse's light, that long after its peak: more is not an instrument's afterglow (0.18), but light
-# that comes from many depths to each pixel.
-MAX_TAIL_SHARE = 0.3
+# Of a pulse's light, that long after its peak: more is not an instrument's afterglow (0.18 of one of a
+# quarter of the light), but light that comes from many depths to each pixel (recorded relay walls: 0.24 to 0.34).
+MAX_TAIL_SHARE = 0.21
 # Bins of range that a pixel spans where a surface is seen nearly edge-on, and the share of the
 # returns' light there: returns scatter by several bins about it, and a fit to them would be as far
 # off. Plates that are turned by 1.3 rad have 0.01 of it, by 1.4 rad 0.43, other scenes up to 0.011.
