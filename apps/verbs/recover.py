@@ -222,8 +222,13 @@ def recover(
     known = frames.figures
     names = ("method", "iterations", "relative_residual", "seconds", "frames_per_second")
     # methods that know how far they are from the best there is say so, and shots that are not clean
-    further = ("why_no_surfaces", "unexplained_light", "duality_gap")
-    further = (*further, "defective_readings", "clipped_readings")
+    further = (
+        "why_no_surfaces",
+        "unexplained_light",
+        "duality_gap",
+        "defective_readings",
+        "clipped_readings",
+    )
     figures = {
         "frames": frames.values.shape[0],
         "image_shape": frames.camera.image_shape,
