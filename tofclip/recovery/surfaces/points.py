@@ -199,10 +199,9 @@ class SurfacePoints:
         self.parts = [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
         places = (self.pixel[part] for part in self.parts)
         self.functions = [basis.evaluate(p) for basis, p in zip(bases, places, strict=True)]
-        self._directions = compute_ray_directions(self.camera, self.row, self.column)
         axis_row, axis_column = self.camera.optical_axis_px
         self._x, self._y = self.column - axis_column, self.row - axis_row
-        self.ray_length = 1 / self._directions[:, 2]
+        self.ray_length = 1 / compute_ray_directions(self.camera, self.row, self.column)[:, 2]
         self.beside = self._find_neighbours()
         self.outer = np.flatnonzero(np.isin(self.column, [0, masks.shape[2] - 1]))
         self.behind = np.zeros(self.surface.size, bool)
@@ -296,7 +295,7 @@ class SurfacePoints:
         out those beyond a limb: there a pixel spans so much range that no line follows it. A point is where
         all that is left of it is on average.
         """
-        places, axis, size = self.places, self.camera.optical_axis_px, self.distance.size
+        places, size = self.places, self.distance.size
         # of each point, how much of its light turning away leaves, and whether its surface ends in it
         self.facing, self.at_limb = np.ones(size), np.zeros(size, bool)
         curved = {k: one for k, one in enumerate(self.bases) if isinstance(one, QuadricBasis)}
@@ -310,8 +309,7 @@ class SurfacePoints:
             inverse, slope, inside = basis.look_between(self.pixel[point], offset, coefficients)
             inverse = np.maximum(inverse, MIN_INVERSE_DEPTH)
             there = np.bincount(point - part.start, inside)[point - part.start] > 0
-            x, y = self._x[point] + offset[0], self._y[point] + offset[1]
-            ways = compute_ray_directions(self.camera, y + axis[0], x + axis[1])
+            _, _, ways = self._aim_at(point, offset)
             distance[own] = np.where(there, 1 / ways[:, 2] / inverse, distance[own])
             facing = 1 / np.hypot(1, self.camera.focal_length_px * slope / inverse)
             light[own] = np.where(there, facing * inside, 1)
@@ -365,16 +363,21 @@ class SurfacePoints:
         ]
         return np.where(np.array(found) < 0, own, found)
 
+    def _aim_at(
+        self, point: NDArray[np.intp], offset: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Where parts of points are, (n,), from the optical axis of the picture, px, to the right and down, and
+        the directions of their rays, (n, 3).
+        """
+        axis_row, axis_column = self.camera.optical_axis_px
+        x, y = self._x[point] + offset[0], self._y[point] + offset[1]
+        return x, y, compute_ray_directions(self.camera, y + axis_row, x + axis_column)
+
     def _find_parts(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Where parts of points are, (places,) each: from the optical axis of the picture, px, to the right
         and down; from that of the lens, m, to the right; and by how much views see them sheared.
         """
-        axis_row, axis_column = self.camera.optical_axis_px
-        x, y = (
-            one[self.places.point] + off
-            for one, off in zip((self._x, self._y), self.places.offset, strict=True)
-        )
-        ways = compute_ray_directions(self.camera, y + axis_row, x + axis_column)
+        x, y, ways = self._aim_at(self.places.point, self.places.offset)
         right, _, depth = self.places.distance * ways.T
         return x, y, right, self.camera.shear_at(depth)
 

@@ -19,7 +19,7 @@ from tofclip.recovery.surfaces.fit import (
     START_ITERATIONS,
     fit_surfaces,
 )
-from tofclip.recovery.surfaces.model import SurfaceModel
+from tofclip.recovery.surfaces.model import SurfaceModel, compare_smoothed
 from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, Image
 from tofclip.recovery.surfaces.returns import list_returns
 from tofclip.recovery.surfaces.start import call_dark, estimate_darkness
@@ -114,13 +114,14 @@ class SurfaceRecovery:
         if not np.any(returns.false_alarm <= DEFAULT_FALSE_ALARM):
             raise call_dark(estimate_darkness(streak, frames))
         model, amplitude, camera = fit.whole.model, fit.whole.amplitude, returns.camera
+        rendered, unknown = model.render(amplitude), model.weights == 0
         # Rectified like every other method's: its residual is of measurements, not of raw pixels.
         predicted, measured = (
-            measure(image, model.weights == 0, model.camera, 0.0)
-            for image in (model.render(amplitude), model.image)
+            measure(image, unknown, model.camera, 0.0) for image in (rendered, model.image)
         )
         started = {name: one for name, one in frames.figures.items() if name != "duality_gap"}
-        left = model.unexplained(amplitude) ** 2 - estimate_darkness(streak, frames) ** 2
+        unexplained = compare_smoothed(rendered, model.image, ~unknown)
+        left = unexplained**2 - estimate_darkness(streak, frames) ** 2
         if left > MUCH_UNEXPLAINED**2:
             started["unexplained_light"] = float(np.sqrt(left))
         error = np.linalg.norm((predicted.values - measured.values)[measured.valid])

@@ -196,25 +196,34 @@ class QuadricBasis(SmoothBasis):
         """
         row, column = np.divmod(pixels, self.image_shape[1])
         functions = self._stack(row + offset[1], column + offset[0])
-        linear, own = coefficients[:LINEAR], coefficients[LINEAR:]
-        q = 2 * self.unit * (functions @ own)
-        inside = q > 0
+        q, slopes = self._differentiate_square(functions, coefficients)
+        inside, linear = q > 0, coefficients[:LINEAR]
         root = np.sqrt(np.where(inside, q, 1.0))
         steepness = [
-            2 / side * (linear[one] + self.sign * self.unit * (functions @ (way @ own)) / root)
-            for one, side, way in zip((1, 2), self._measure_box()[::-1], (BY_X, BY_Y), strict=True)
+            2 / side * along + self.sign * slope / (2 * root)
+            for along, side, (slope, _) in zip(
+                linear[1:], self._measure_box()[::-1], slopes, strict=True
+            )
         ]
         inverse = functions[:, :LINEAR] @ linear + self.sign * np.where(inside, root, 0)
         return inverse, np.hypot(*steepness), inside
 
-    def _round_off(self, functions: FloatArray, coefficients: FloatArray) -> tuple[Any, ...]:
-        """Twice the square of the root, which is q inside and rounded off at the limb; its size there;
-        and the slopes of q, each with what makes of monomials its derivatives by q's coefficients.
+    def _differentiate_square(
+        self, functions: FloatArray, coefficients: FloatArray
+    ) -> tuple[FloatArray, list[tuple[FloatArray, FloatArray]]]:
+        """q, and its slopes to the right and down, 1/px, each with what makes of monomials its derivatives by
+        q's coefficients.
         """
         own, (high, wide) = coefficients[LINEAR:], self._measure_box()
-        q = 2 * self.unit * (functions @ own)
         ways = 4 * self.unit / wide * BY_X, 4 * self.unit / high * BY_Y
         slopes = [(functions @ (way @ own), way) for way in ways]
+        return 2 * self.unit * (functions @ own), slopes
+
+    def _round_off(self, functions: FloatArray, coefficients: FloatArray) -> tuple[Any, ...]:
+        """Twice the square of the root, which is q inside and rounded off at the limb; its size there;
+        and the slopes of q, as `_differentiate_square` has them.
+        """
+        q, slopes = self._differentiate_square(functions, coefficients)
         limb = LIMB * np.hypot(*(slope for slope, _ in slopes)) + np.finfo(np.float64).tiny
         size = np.hypot(q, limb)
         # without the difference of large numbers beyond the limb
