@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tofclip.lidar import PointCloud, Returns
+    from tofclip.lidar.cloud import DetectedObject
     from tofclip.lidar.photons import SurfaceImage
-    from tofclip.lidar.processing import DetectedObject
     from tofclip.shots import Frames, Streak
     from tofclip.simulate import GroundTruth
 

@@ -30,7 +30,6 @@ from tofclip.simulate import (
     simulate_shot,
 )
 from tofclip.simulate.bodies import Body, Lambertian, Sphere
-from tofclip.simulate.demo import ANGLES_DEG, GAINS, LENSLET_PITCH_M, place_plate
 from tofclip.simulate.patterns import (
     TEXELS,
     make_checkerboard,
@@ -38,6 +37,7 @@ from tofclip.simulate.patterns import (
     make_rings,
     make_stripes,
 )
+from tofclip.simulate.streak import ANGLES_DEG, GAINS, LENSLET_PITCH_M, place_plate
 from tofclip.units import MILLIMETRE
 
 METHODS = ("l1", "tv", "surfaces")

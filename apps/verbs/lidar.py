@@ -77,7 +77,7 @@ def bag(
     from tofclip.lidar.ros import MCAP_SUFFIX, NANOSECONDS_PER_SECOND, StampedCloud
     from tofclip.sequences import list_files
     from tofclip.sequences.ranger import build_cloud_path
-    from tofclip.sequences.ranging import PLAN_NAME
+    from tofclip.sequences.recovering import PLAN_NAME
 
     if not (rate_hz > 0 and start_s >= 0):
         raise InputError("the rate must be positive and the start not negative")
@@ -216,7 +216,7 @@ def scene(
 
     from apps.figures.shot import make_scene_figure
     from tofclip.lidar import Detection, depth, point_cloud
-    from tofclip.lidar.processing import find_objects
+    from tofclip.lidar.cloud import find_objects
     from tofclip.lidar.significance import SCENE_BRIGHTNESS_QUANTILE
     from tofclip.notebook import save_figure
     from tofclip.shots import Frames

@@ -45,7 +45,7 @@ from apps.viewer.viewpoint import (
 )
 from tofclip.arrays import AnyArray, FloatArray
 from tofclip.lidar import PointCloud
-from tofclip.lidar.processing import fit_plane
+from tofclip.lidar.cloud import fit_plane
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:

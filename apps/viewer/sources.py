@@ -20,11 +20,11 @@ from apps.viewer.shots import LiveShots, Shots, make_view
 from apps.viewer.source import Choice, Inflow, Picture, Setting, Source, View, make_cloud
 from tofclip.arrays import Float32Array, FloatArray
 from tofclip.camera import Camera, Measurement, Rectifier
+from tofclip.camera.model import compute_ray_directions
 from tofclip.camera.noise import MeasurementNoise, find_dazzled
 from tofclip.errors import FileFormatError
 from tofclip.lidar import PointCloud, depth
 from tofclip.lidar.export import read_table
-from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.photons import PhotonCube
 from tofclip.loading import CLOUD_SUFFIXES, load
 from tofclip.plugins import METHODS, list_settings

@@ -21,12 +21,12 @@ from tofclip.simulate import (
     make_default_scene,
     simulate_shot,
 )
-from tofclip.simulate.demo import place_plate
 from tofclip.simulate.patterns import (
     make_letter,
     make_plain_pattern,
     make_stripes,
 )
+from tofclip.simulate.streak import place_plate
 from tofclip.units import SPEED_OF_LIGHT
 
 SENSOR_PIXELS = 256

@@ -15,7 +15,7 @@ from tofclip.camera import (
     SkewSweep,
 )
 from tofclip.camera.model import sweep_from_record
-from tofclip.camera.parallax import (
+from tofclip.camera.registration import (
     find_sharpest_shears,
     fit_parallax_to_centres,
     fit_parallax_to_shears,

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tofclip.camera import Camera
+from tofclip.camera.model import distort_directions
 from tofclip.errors import (
     CalibrationError,
     FileFormatError,
@@ -32,7 +33,6 @@ from tofclip.lidar import (
     save_depth,
 )
 from tofclip.lidar.cloud import save_organised
-from tofclip.lidar.geometry import distort_directions
 from tofclip.units import SPEED_OF_LIGHT
 
 PLAIN = (".ply", ".pcd", ".csv", ".npz", ".h5")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tofclip.errors import InputError, MissingDependencyError
 from tofclip.lidar import PointCloud
-from tofclip.lidar.processing import (
+from tofclip.lidar.cloud import (
     align_clouds,
     downsample_cloud,
     estimate_normals,

@@ -10,7 +10,7 @@ import scipy.sparse
 
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
-from tofclip.lidar.pulse_tables import TraceBins
+from tofclip.lidar.pulse import TraceBins
 from tofclip.lidar.signal_rows import BrightFrameFinder, RowBlock, SignalRowFinder
 from tofclip.operators.sparse import Tiles
 from tofclip.recovery import DepthLockedFocus, FixedFocus

@@ -9,7 +9,7 @@ import pytest
 
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, Pulse, depth
-from tofclip.lidar.pulse_tables import PhaseTable
+from tofclip.lidar.pulse import PhaseTable
 from tofclip.shots import Frames
 
 BIN, FWHM = 20e-12, 60e-12

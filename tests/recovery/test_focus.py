@@ -32,8 +32,8 @@ from tofclip.simulate import (
     render_true_frames,
     simulate_shot,
 )
-from tofclip.simulate.demo import FOCAL_LENGTH_PX
 from tofclip.simulate.patterns import TEXELS, make_letter
+from tofclip.simulate.streak import FOCAL_LENGTH_PX
 from tofclip.solvers import Backprojection, Sparse
 from tofclip.units import SPEED_OF_LIGHT
 

@@ -17,8 +17,8 @@ from tofclip.recovery import make_method, open_shot, plan_recovery, recover
 from tofclip.recovery.defects import estimate_noise, find_clipping_level, find_defects
 from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
-from tofclip.simulate.demo import make_default_camera
 from tofclip.simulate.patterns import make_plain_pattern
+from tofclip.simulate.streak import make_default_camera
 from tofclip.solvers import PlugAndPlay, TotalVariation
 
 ORACLE_CAMERA = Camera(

@@ -13,7 +13,7 @@ from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
 from tofclip.io.streaks import StreakStack, save_stack
 from tofclip.recovery import DepthLockedFocus
 from tofclip.sequences.ranger import RangingPipeline
-from tofclip.sequences.ranging import (
+from tofclip.sequences.recovering import (
     JitterEstimator,
     RangingSettings,
     compute_light_curve,

@@ -11,7 +11,7 @@ import pytest
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
 from tofclip.lidar import depth, point_cloud
-from tofclip.lidar.pulse_tables import TraceBins
+from tofclip.lidar.pulse import TraceBins
 from tofclip.recovery import DepthLockedFocus, recover
 from tofclip.sequences import make_pipeline
 from tofclip.sequences.ranger import RangingPipeline, SurfacePipeline, WarmStartedRecovery

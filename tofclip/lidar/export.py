@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tofclip.arrays import AnyArray
+from tofclip.camera.model import compute_ray_directions
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import (
     BoundedFile,
@@ -40,7 +41,6 @@ from tofclip.files import (
     translate_read_errors,
 )
 from tofclip.io.archive import Archive, ArchiveEntry
-from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.notebook import paint
 from tofclip.shots import Returns
 

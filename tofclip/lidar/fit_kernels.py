@@ -1,7 +1,7 @@
 """The compiled fit of pulses to a trace.
 
 On an even time axis a Gauss-Newton step is two products of the trace with rows of a table of the
-pulse (`tofclip.lidar.pulse_tables`). A step from the nearest tabulated phase ends where one from the
+pulse (`tofclip.lidar.pulse`). A step from the nearest tabulated phase ends where one from the
 exact phase would, but for the square of their distance, at most (1 / 128)^2 of a bin: far below where
 the steps end (`CONVERGENCE_STEP_BINS`). Returns that overlap take turns, each against what the others
 leave, which undoes their pull on each other.
@@ -37,7 +37,7 @@ from tofclip.lidar.peak_kernels import (
     search_part,
     search_step,
 )
-from tofclip.lidar.pulse_tables import MAX_OFFSET_BINS, PHASES_PER_BIN
+from tofclip.lidar.pulse import MAX_OFFSET_BINS, PHASES_PER_BIN
 from tofclip.vectors import STEP, fill_vector, load_vector, store_vector, sum_vector
 
 # from near the top a fit has converged after two; more are for returns that overlap

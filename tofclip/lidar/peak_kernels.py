@@ -60,8 +60,8 @@ class Axis(NamedTuple):
     matched: Float32Array  # (bins, width), filters of unit energy, nowhere negative
     starts: IntArray  # (bins,), first bin that each of them takes
     sums: FloatArray  # (bins,), over each of them
-    windows: NDArray[np.int32]  # (bins, 4), `tofclip.lidar.pulse_tables.list_windows`
-    even: BoolArray  # (bins,), `tofclip.lidar.pulse_tables.PhaseTable.find_even_bins`
+    windows: NDArray[np.int32]  # (bins, 4), `tofclip.lidar.pulse.list_windows`
+    even: BoolArray  # (bins,), `tofclip.lidar.pulse.PhaseTable.find_even_bins`
 
 
 class Limits(NamedTuple):

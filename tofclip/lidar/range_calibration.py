@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from tofclip.camera import Camera, RangeCalibration
+from tofclip.camera.model import compute_ray_directions
 from tofclip.errors import CalibrationError, InputError, require_positive
-from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.shots import Returns
 from tofclip.units import MAD_TO_SIGMA, MILLIMETRE, SPEED_OF_LIGHT
 

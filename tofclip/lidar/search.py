@@ -34,11 +34,10 @@ import numpy as np
 
 from tofclip.arrays import Float32Array, FloatArray, IntArray, to_numpy
 from tofclip.camera import Camera
+from tofclip.camera.model import compute_ray_directions
 from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError, ShapeError, require, require_type
-from tofclip.lidar.geometry import compute_ray_directions
-from tofclip.lidar.pulse import Pulse
-from tofclip.lidar.pulse_tables import PictureTraces, PulseFilters, TraceBins, Traces
+from tofclip.lidar.pulse import PictureTraces, Pulse, PulseFilters, TraceBins, Traces
 from tofclip.lidar.range_calibration import correct_returns
 from tofclip.lidar.significance import (
     CANDIDATES,

@@ -17,7 +17,7 @@ import scipy
 
 from tofclip.arrays import BoolArray, Float32Array, FloatArray, IntArray, empty_aligned
 from tofclip.errors import InputError
-from tofclip.lidar.pulse_tables import TraceBins
+from tofclip.lidar.pulse import TraceBins
 from tofclip.operators.sparse import Tiles
 from tofclip.solvers.direct import GROUP_PIXELS, InverseTraces
 from tofclip.threads import LANES, count_block_threads, run_blocks

@@ -16,7 +16,7 @@ from tofclip.lidar.peak_kernels import (
     Limits,
     Room,
 )
-from tofclip.lidar.pulse_tables import PulseFilters, Traces, list_windows
+from tofclip.lidar.pulse import PulseFilters, Traces, list_windows
 from tofclip.lidar.significance import Detection
 from tofclip.vectors import LENGTH
 

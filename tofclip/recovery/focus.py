@@ -15,14 +15,14 @@ import numpy as np
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera, Measurement, measure
 from tofclip.camera.model import split_by_shear
-from tofclip.camera.parallax import (
+from tofclip.camera.registration import (
     GATE_METHOD,
     FocusCurve,
     Parallax,
+    count_registration_iterations,
     find_sharpest_shears,
     fit_parallax_to_shears,
 )
-from tofclip.camera.registration import count_registration_iterations
 from tofclip.errors import CalibrationError, InputError, require, require_positive
 from tofclip.recovery.shot import Shot
 from tofclip.solvers import Progress, ignore_progress
@@ -112,7 +112,7 @@ class DepthLockedFocus(Focus):
         if camera.lenslet_pitch <= 0:
             raise CalibrationError(
                 "the camera does not know its lenslet pitch, so that range says nothing about shear: calibrate it "
-                "(tofclip.camera.parallax) or choose another `focus`, fixed:S or stack:S0:S1:N"
+                "(tofclip.camera) or choose another `focus`, fixed:S or stack:S0:S1:N"
             )
 
     def plan_segments(self, camera: Camera, times: FloatArray, **others: Any) -> list[FrameSegment]:

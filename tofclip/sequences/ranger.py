@@ -23,7 +23,7 @@ from tofclip.arrays import BoolArray, Float32Array, FloatArray
 from tofclip.camera import Camera, Rectifier
 from tofclip.errors import require_shape
 from tofclip.lidar import PointCloud, point_cloud
-from tofclip.lidar.pulse_tables import PictureTraces, TraceBins, Traces
+from tofclip.lidar.pulse import PictureTraces, TraceBins, Traces
 from tofclip.lidar.search import ReturnSearch, keep_probable
 from tofclip.lidar.signal_rows import RowBlock, SignalRowFinder
 from tofclip.operators import LinearOperator, LineProjection
@@ -396,7 +396,7 @@ class RangingPipeline:
 
 
 class _ShotTraces:
-    """Traces of a shot, recovered as they are asked for; see `tofclip.lidar.pulse_tables.Traces`."""
+    """Traces of a shot, recovered as they are asked for; see `tofclip.lidar.pulse.Traces`."""
 
     def __init__(
         self, pipeline: RangingPipeline, measurements: Float32Array, bins: TraceBins

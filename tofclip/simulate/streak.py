@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray
-from tofclip.camera import Camera
+from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import require, require_shape
 from tofclip.lidar import Returns
 from tofclip.shots import Frames, Streak
@@ -33,6 +33,13 @@ from tofclip.simulate.bodies import (
     look_up_reflectance,
     number_ray_pixels,
     spread_pulse,
+)
+from tofclip.simulate.patterns import (
+    Pattern,
+    make_checkerboard,
+    make_letter,
+    make_rings,
+    make_stripes,
 )
 from tofclip.storage import collect_provenance
 from tofclip.units import FWHM_PER_SIGMA, MAD_TO_SIGMA, SPEED_OF_LIGHT
@@ -494,3 +501,83 @@ def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedS
     )
     truth, signal = GroundTruth.from_scene(scene, instrument), (exposure * light).astype(np.float32)
     return SimulatedShot(streak, camera, truth, signal, exposure)
+
+
+CENTRES_PX = (147.7, 320.0, 490.2, 664.1, 835.5, 1011.5, 1192.3)
+ANGLES_DEG = (-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0)
+GAINS = (0.92, 1.08, 1.02, 0.90, 1.02, 0.96, 1.10)
+OFFSETS_BINS = (-16.3, -10.4, -4.8, 0.0, 3.9, 8.2, 12.0)
+STRETCHES = (0.009, 0.008, 0.004, 0.0, -0.001, -0.006, -0.006)
+TIME_ZERO_S = -10.784e-9
+CENTRE_ERROR_PX = 0.4  # the calibration's, by which a recovery starts off
+FOCAL_LENGTH_PX = 560.0
+LENSLET_PITCH_M = 2.3e-3
+FOCUS_DISTANCE_M = 2.3
+
+
+def make_default_camera() -> Camera:
+    """Return the demonstration's camera, with its true gains and sweep: modelled on the seed paper's, seven
+    lenslets whose lines lie between -43 and 48 degrees, skewed against each other by up to 16 rows.
+    """
+    return Camera(
+        centres_px=np.array(CENTRES_PX),
+        angles=np.radians(ANGLES_DEG),
+        image_shape=(128, 128),
+        slit_width_px=1344,
+        gains=np.array(GAINS),
+        sweep=SkewSweep(np.array(CENTRES_PX), np.array(OFFSETS_BINS), np.array(STRETCHES)),
+        time_zero=TIME_ZERO_S,
+        pulse_fwhm=60e-12,
+        focal_length_px=FOCAL_LENGTH_PX,
+        lenslet_pitch=LENSLET_PITCH_M,
+        focus_distance=FOCUS_DISTANCE_M,
+    )
+
+
+def make_nominal_camera(camera: Camera) -> Camera:
+    """Return a camera as focus pictures would give it.
+
+    They cannot know sweep and gains, and know the slit centres to half a pixel only: these have to
+    be found from the shot.
+    """
+    errors_px = CENTRE_ERROR_PX * np.cos(np.pi * np.arange(camera.views))
+    return camera.replace(
+        sweep=None, gains=np.ones(camera.views), centres_px=camera.centres_px + errors_px
+    )
+
+
+def make_default_instrument() -> Instrument:
+    """Return the demonstration's camera with a detector of 2000 photons in the brightest pixel."""
+    return Instrument(make_default_camera(), StreakDetector(full_scale_photons=1900.0))
+
+
+def make_default_scene() -> Scene:
+    """Return four cut-out letters and three textured plates between 1.7 and 3.2 m."""
+    # pattern, middle and side in pixels, depth in m, yaw and pitch in rad
+    plates: tuple[tuple[Pattern, Any, float, float, float, float], ...] = (
+        (make_letter("U", 0.8), (-25, -24), 34, 1.75, 0.0, 0.0),
+        (make_letter("C", 0.8), (23, -27), 34, 2.05, 0.15, 0.0),
+        (make_letter("L", 0.8), (-24, 22), 32, 2.35, 0.0, 0.0),
+        (make_letter("A", 0.8), (22, 20), 36, 2.62, 0.0, -0.15),
+        (make_checkerboard(4, 0.3, 0.9), (2, -2), 36, 2.85, -0.3, 0.0),
+        (make_rings(3, 0.3, 0.9), (-2, 36), 36, 3.0, 0.0, 0.0),
+        (make_stripes(4, 0.3, 0.9), (0, 0), 96, 3.18, 0.0, 0.0),
+    )
+    return Scene(tuple(place_plate(*plate) for plate in plates))
+
+
+def place_plate(
+    pattern: Pattern,
+    middle_px: tuple[float, float],
+    side_px: float,
+    depth: float,
+    yaw: float = 0.0,
+    pitch: float = 0.0,
+    focal_length_px: float = FOCAL_LENGTH_PX,
+) -> Body:
+    """Square plate that appears around pixel offset `middle_px` (x, y) from the optical axis,
+    `side_px` wide.
+    """
+    pixel = depth / focal_length_px
+    centre: Vector = (middle_px[0] * pixel, middle_px[1] * pixel, depth)
+    return make_plate(centre, (side_px * pixel, side_px * pixel), pattern, yaw, pitch)
