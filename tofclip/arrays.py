@@ -93,9 +93,7 @@ def clip_values(values: Array, lowest: float | None = None, highest: float | Non
 
 
 def to_numpy(array: Array) -> AnyArray:
-    """Return the values as a NumPy array, fetched from wherever they are; a NumPy array comes back
-    as it is.
-    """
+    """Return the values as a NumPy array, fetched from wherever they are; NumPy's as it is."""
     if hasattr(array, "detach"):  # PyTorch: a gradient is carried along
         array = array.detach().cpu()
     elif hasattr(array, "get") and not is_numpy(array):  # CuPy copies nothing unless asked to
@@ -135,9 +133,7 @@ def zeros(shape: tuple[int, ...], like: Array) -> Array:
 
 
 def scalar_like(value: float, like: Array) -> Array:
-    """Return a number of the type of `like`, where `like` is: for functions that not every library
-    has for Python's.
-    """
+    """Return a number of the type of `like`, and where it is: not every function takes Python's."""
     return like.dtype.type(value) if is_numpy(like) else zeros((), like) + value
 
 
@@ -184,9 +180,7 @@ class ComputeDevice:
         return namespace(library.asarray([0.0])).asarray(contiguous, device=self.device)
 
     def activate(self) -> AbstractContextManager[Any]:
-        """Return a context in which what is made is made here: CuPy works on its current device
-        only.
-        """
+        """Return a context in which what is made is made here: CuPy works on its current device."""
         return self.device if self.library == "cupy" and self.device else nullcontext()
 
     def __str__(self) -> str:

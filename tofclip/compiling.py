@@ -60,9 +60,7 @@ def _say_not_kept() -> None:
 
 
 def compile_and_keep(**options: Any) -> Callable[[Any], Any]:
-    """Make the decorator of loops that are kept on disk, where there is a place for them; options
-    are those of `numba.njit`.
-    """
+    """Make the decorator of loops that are kept on disk; `options` are those of `numba.njit`."""
 
     def decorate(function: Any) -> Any:
         loop: Any = njit(**{"nogil": True, **options})(function)

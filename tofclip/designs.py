@@ -191,9 +191,7 @@ def _fit_pulses(
 def draw_shots(
     design: Design, scene: Scene, shots: int, seed: int
 ) -> tuple[float, Iterator[tuple[Float32Array, BoolArray]]]:
-    """Return the exposure and noisy readings (bins, readings) with where they are saturated, shot by
-    shot.
-    """
+    """Return the exposure and, shot by shot, noisy readings (bins, readings) and the saturated."""
     detector, noise = design.instrument.detector, np.random.default_rng(seed)
     if design.encoder is None:
         shot = simulate_shot(scene, design.instrument, seed)

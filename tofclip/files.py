@@ -210,9 +210,7 @@ def compute_sha256(path: str | Path) -> str:
 
 
 def identify_file(file: Path) -> str:
-    """Say by what a file's content is known again: its hash, or for a large one what
-    `MAX_HASHED_BYTES` says.
-    """
+    """Say by what a file's content is known again: its hash, or see `MAX_HASHED_BYTES`."""
     with translate_read_errors(file):
         state = file.stat()
         if state.st_size <= MAX_HASHED_BYTES:
@@ -420,8 +418,6 @@ def explain_os_error(fault: OSError) -> str:
 
 
 def format_error_line(fault: BaseException) -> str:
-    """Return an exception's message without line breaks, cut where it repeats a whole file, or its
-    name where it has none.
-    """
+    """Return an exception's message without line breaks, cut where long, or its name."""
     text = " ".join(str(fault).split()) or type(fault).__name__
     return text if len(text) <= MAX_MESSAGE_LENGTH else f"{text[:MAX_MESSAGE_LENGTH]} ..."

@@ -128,9 +128,7 @@ def _open(path: str | Path, values: bool) -> tuple[Record, Any]:
 
 
 def _describe_archive(archive: Archive, kind: str, values: bool = False, *axes: str) -> Record:
-    """A file of named arrays; the ends of their names are their units. Without `values` single
-    numbers are read alone.
-    """
+    """A file of named arrays, whose names end in units. Without `values` only numbers are read."""
     fields = {}
     for name in sorted(archive.names):
         entry = archive.describe(name)

@@ -42,9 +42,7 @@ def nmse(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
 
 
 def nmse_energy(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
-    """Squared error relative to the energy of the truth: ``sum (h - g)^2 / sum g^2``; arguments as
-    in `nmse`.
-    """
+    """Squared error over the truth's energy, ``sum (h - g)^2 / sum g^2``; else as `nmse`."""
     h, g = _crop_borders(estimate, truth, border_px)
     energy = float(np.sum(g**2))
     require(energy != 0, "the truth is zero everywhere: its energy cannot normalise an error")

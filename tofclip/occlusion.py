@@ -55,9 +55,7 @@ class InactiveRegion:
 
     @property
     def length(self) -> float:
-        """How far the region reaches behind the occluder, m: ``l_d = d D / (L - D)``; infinite
-        where D >= L.
-        """
+        """How far the region reaches behind the occluder, m: ``d D / (L - D)``; else infinite."""
         if not self.is_bounded:
             return float("inf")
         return self.distance * self.width / (self.baseline - self.width)
@@ -104,9 +102,7 @@ class Rig:
         return self.setup.camera(self.array.image_shape, self.array.views)
 
     def compute_flight_time(self, distance: AnyArray) -> AnyArray:
-        """Return the mean time of flight, over lamps and views, of points on the axis, s;
-        `distance` (n,) in m.
-        """
+        """Mean time of flight, s, over lamps and views, of points on the axis at `distance`, m."""
         places = np.stack([self.array.position((v, u)) for v, u in self.array.views])
         points = np.stack([0 * distance, 0 * distance, distance], axis=-1)[:, np.newaxis]
         ends = (self.lamps, places)

@@ -338,9 +338,7 @@ class Returns(Storable):
         return self[np.sort(order[first_of_pixel])]
 
     def image(self, name: str) -> Float32Array:
-        """Picture (y, x) of one of `PICTURE_COLUMNS` of each pixel's most intense return; NaN where
-        nothing came back.
-        """
+        """Picture (y, x) of one of `PICTURE_COLUMNS`, of the most intense return; NaN: none."""
         require(name in PICTURE_COLUMNS, f"returns have no property '{name}' to show as a picture")
         picture = np.full(self.camera.image_shape, np.nan, dtype=np.float32)
         upwards = np.argsort(self.intensity, kind="stable")  # the last one written wins
@@ -512,9 +510,7 @@ class Frames(Storable):
         return render_html("Frames", rows, np.asarray(self).max(axis=0))
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the sum of all frames into matplotlib Axes `ax`, by default the current figure's;
-        return them.
-        """
+        """Draw the sum of all frames into Axes `ax`, by default the current ones; return them."""
         title = f"{len(self)} frames, {self._range_text}"
         return plot_picture(np.asarray(self).sum(axis=0), title, ax)
 

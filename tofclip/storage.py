@@ -119,9 +119,7 @@ class Record:
         return float(value)
 
     def child(self, name: str, kind: str) -> Record:
-        """Return the record that travels inside this one; `FileFormatError` where none of that kind
-        does.
-        """
+        """Return the record inside this one; `FileFormatError` where none of that kind is."""
         child = self.children.get(name)
         if child is None or child.kind != kind:
             raise FileFormatError(self.origin, f"{self.kind} record carries no {kind} '{name}'")
@@ -299,9 +297,7 @@ def _to_scalar(value: Any) -> Scalar:
 
 
 def collect_provenance(settings: Mapping[str, Any], *inputs: str | Path) -> dict[str, Any]:
-    """Describe how a result came about: program version, time, settings, and a hash of every input
-    file.
-    """
+    """Describe how a result came about: version, time, settings, and each input's hash."""
     return {
         "software": f"tofclip {__version__}",
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),

@@ -36,9 +36,7 @@ BLAS_PACKAGES = ("cupy", "cv2", "jax", "mkl", "open3d", "sklearn", "tensorflow",
 
 
 def thread_count() -> int:
-    """Return how many threads to use: the environment's ``TOFCLIP_THREADS``, else one for each core
-    that this process may run on.
-    """
+    """Return how many threads to use: ``TOFCLIP_THREADS``, else one for each core we may use."""
     wanted = os.environ.get(THREADS_VARIABLE, "")
     if not wanted:
         affinity = getattr(os, "sched_getaffinity", None)

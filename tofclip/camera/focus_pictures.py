@@ -187,9 +187,7 @@ def _fit_dot(profile: FloatArray, column: int) -> tuple[float, float]:
 def _find_line_pixels(
     signal: FloatArray, slit_row: int, column: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rows, columns and brightness of the connected bright region that crosses the slit at
-    `column`.
-    """
+    """Rows, columns and brightness of the connected bright region that crosses the slit there."""
     from scipy.ndimage import gaussian_filter, label
 
     # Smoothed, or noise would cut a faint line into pieces.

@@ -53,9 +53,7 @@ def sample_row(counts, dark, position, runs, reading):
 
 @fast_loop
 def sample_rows(counts, dark, raw_row, runs, run_starts, measurements):
-    """Sample some rows; `runs` are those of all rows, one after the other, of which row r's begin at
-    ``run_starts[r]``.
-    """
+    """Sample some rows; `runs` are those of all, of which row r's begin at ``run_starts[r]``."""
     for row in range(raw_row.shape[0]):
         own = runs[run_starts[row] : run_starts[row + 1]]
         sample_row(counts, dark, raw_row[row], own, measurements[row])

@@ -44,9 +44,7 @@ class Sweep(Storable):
             object.__setattr__(self, item.name, values)
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the raw (row, column) of rectified positions `row` and `column`, pixels; they
-        broadcast against each other.
-        """
+        """Return the raw (row, column) of rectified positions `row` and `column`, pixels."""
         raise NotImplementedError
 
 
@@ -129,9 +127,7 @@ class PolynomialSweep(Sweep):
 
 @dataclass(frozen=True)
 class ProjectiveSweep(Sweep):
-    """A homography: ``[raw column, raw row, 1] ~ matrix @ [column, row, 1]``, 0-based pixels;
-    `matrix` (3, 3).
-    """
+    """A homography: ``[raw column, raw row, 1] ~ matrix @ [column, row, 1]``; `matrix` (3, 3)."""
 
     RECORD_KIND = "projective_sweep"
 

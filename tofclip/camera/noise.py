@@ -71,9 +71,7 @@ class MeasurementNoise:
         return figures | ({DAZZLE_FIGURE: self.dazzle} if np.isfinite(self.dazzle) else {})
 
     def compute_variance(self, light: Float32Array) -> Float32Array:
-        """Return the variance of each measurement, (columns, frames), of which the frames predict so
-        much light, not negative.
-        """
+        """Return each measurement's variance, (columns, frames), of so much predicted light."""
         variance = self.floor**2 + self.gain * light
         if light.max(initial=0) <= self.dazzle:
             variance += self.misfit**2 * np.mean(light**2, axis=0)
@@ -116,9 +114,7 @@ def find_dazzled(measurement: Measurement, noise: MeasurementNoise) -> BoolArray
 
 
 def find_glints(operator: LineProjection, dazzled: BoolArray) -> BoolArray:
-    """Find the pixels, (frames, rows, columns), that are seen by dazzled measurements only, (columns,
-    frames).
-    """
+    """Find the pixels, (frames, rows, columns), that only dazzled measurements see."""
     transposed = operator.matrix.T
     weight = transposed @ np.ones(dazzled.shape[0], np.float32)
     share = (transposed @ dazzled.astype(np.float32)).T

@@ -59,9 +59,7 @@ def measure(
 
 
 def require_width(counts: Float32Array, camera: Camera) -> None:
-    """Raise `CalibrationError` unless `counts`, (rows, columns), are as wide as the slit of
-    `camera`.
-    """
+    """Raise `CalibrationError` unless `counts` are as wide as the slit of `camera`."""
     if counts.shape[1] != camera.slit_width_px:
         turned = ", or turn the picture" if counts.shape[0] == camera.slit_width_px else ""
         raise CalibrationError(
@@ -179,9 +177,7 @@ class Rectifier:
 
     @cached_property
     def _runs(self) -> tuple[NDArray[np.uint64], IntArray]:
-        """Neighbours in a row that come from the same two raw rows, and where each row's begin; see
-        `sample_row`.
-        """
+        """Neighbours in a row between the same two raw rows, and where each row's begin."""
         rows, columns = self._raw_row.shape
         top = np.clip(self._raw_row.astype(np.int64), 0, max(rows - 2, 0))
         top[(self._raw_row < 0) | (self._raw_row > rows - 1)] = rows

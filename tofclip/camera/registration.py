@@ -222,9 +222,7 @@ def count_registration_iterations() -> int:
 
 
 def _select_frames(measurement: Measurement) -> IndexArray:
-    """Pick instants evenly in cumulated brightness, so that far and dim objects are represented
-    too.
-    """
+    """Pick instants evenly in cumulated brightness: far and dim objects are represented too."""
     light = (measurement.values * measurement.valid).sum(axis=0, dtype=np.float64)
     brightness = np.sqrt(np.maximum(light, 0))
     share = np.cumsum(brightness) / brightness.sum()
@@ -268,9 +266,7 @@ class _Model:
 def _refine_camera(
     camera: Camera, start: Camera, evidence: _Evidence, slope: Float32Array, knows_times: bool
 ) -> Camera:
-    """Solve for every view's corrections and apply them; the reference view keeps its time, gains
-    average 1.
-    """
+    """Correct every view; the reference view keeps its time, gains average 1."""
     sweep = camera.sweep
     if not isinstance(sweep, SkewSweep):
         raise CalibrationError(
@@ -514,9 +510,7 @@ def find_sharpest_shears(
 
 
 def measure_sharpness(frames: Float32Array) -> float:
-    """Mean square over squared mean of the frames, weighted by their light; 1 for even pictures, 0
-    without light.
-    """
+    """Mean square over squared mean of the `frames`, weighted by light; 0 without light."""
     flat = frames.reshape(frames.shape[0], -1)
     light = flat.sum(axis=1, dtype=np.float64)
     square = np.einsum("tp,tp->t", flat, flat, dtype=np.float64)

@@ -160,9 +160,7 @@ def _read_values(*where: Any) -> AnyArray:
 
 
 class _MatMatrix:
-    """A matrix that begins at byte `at` of unpacked content; what is missing there raises errors of
-    struct and NumPy.
-    """
+    """A matrix at byte `at` of unpacked content; what is missing raises struct's errors or NumPy's."""
 
     def __init__(self, path: Path, order: str, content: bytes, at: int = 0) -> None:
         self._path, self._order, self._content = path, order, content

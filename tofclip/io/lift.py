@@ -88,9 +88,7 @@ class RelayWall:
 def _align_directions(
     focal_length_px: float, pixels: FloatArray, directions: FloatArray
 ) -> tuple[float, FloatArray]:
-    """How well the pixels' directions align with `directions` (1: exactly), and the rotation that
-    does it.
-    """
+    """How well pixels align with `directions` (1: exactly), and the rotation that does it."""
     looking = np.vstack([pixels, np.full(pixels.shape[1], focal_length_px)])
     looking /= np.linalg.norm(looking, axis=0)
     # Wahba's problem: the rotation that maximises the trace is the product of the singular vectors.
@@ -99,9 +97,7 @@ def _align_directions(
 
 
 def read_relay_wall(archive: Archive, image_shape: tuple[int, int]) -> RelayWall:
-    """Take the relay wall out of a LIFT archive; its window has the picture's middle pixel in its
-    own middle.
-    """
+    """Take the wall out of a LIFT archive; the picture's middle is its window's as well."""
     points = np.moveaxis(archive.array("wall_grid_m", 3, None, None), 0, -1).astype(np.float64)
     axis_px = (image_shape[0] // 2, image_shape[1] // 2)
     offset_px = (axis_px[0] - points.shape[0] // 2, axis_px[1] - points.shape[1] // 2)

@@ -144,9 +144,7 @@ def read_folder(folder: Path) -> LightField:
 
 
 def compute_luminance(picture: AnyArray) -> AnyArray:
-    """Return the luminance (rows, columns), float32, of a grey or colour picture; an alpha channel
-    is dropped.
-    """
+    """Return the luminance (rows, columns), float32, of a picture; alpha is dropped."""
     if picture.ndim == 2:
         return picture.astype(np.float32)
     if picture.shape[-1] < 3:
@@ -231,9 +229,7 @@ def read_light_field(path: str | Path) -> LightField:
 
 
 def write_light_field(light_field: LightField, path: str | Path) -> None:
-    """Write a light field, whole or not at all, as ``.h5``, ``.hdf5`` or ``.exr`` (float32 values,
-    ZIP compression).
-    """
+    """Write a light field, whole or not at all, as ``.h5``, ``.hdf5`` or ``.exr`` (float32)."""
     target = Path(path)
     require_suffix(target, *_WRITERS)
     _WRITERS[target.suffix.lower()](light_field, target)

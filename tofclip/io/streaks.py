@@ -120,9 +120,7 @@ class StreakStack:
 
     @staticmethod
     def is_one(path: str | Path) -> bool:
-        """Return whether an HDF5 file holds a stack: dataset ``counts`` with one axis more than a
-        streak image.
-        """
+        """Return whether an HDF5 file holds a stack: ``counts`` with an axis more than an image."""
         import h5py
 
         refusals = OSError, KeyError, RuntimeError

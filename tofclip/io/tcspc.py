@@ -221,9 +221,7 @@ def read_scan(events: PtuEvents) -> ScannedPhotons:
 
 
 def _find_lines(events: PtuEvents, rows: int, columns: int) -> _Lines:
-    """Read through the markers; lines beyond the picture's rows, and those without an end, are left
-    out.
-    """
+    """Read through the markers; lines beyond the picture, or without an end, are left out."""
     numbers = (int(events.tags.get(f"ImgHdr_{name}", 0)) for name in MARKER_TAGS)
     start, stop, change = (1 << number - 1 if 0 < number <= 8 else 0 for number in numbers)
     marked: dict[int, list[IntArray]] = {start: [], stop: [], change: []}
@@ -258,9 +256,7 @@ EXTENDED_COUNT = 0x7FFF  # where 16 bits do not suffice: the number of blocks is
 
 
 def read_sdt_blocks(path: Path) -> tuple[list[AnyArray], float]:
-    """Read counts (..., bins) of each block, (rows, columns, bins) of an image, and the duration of
-    a bin, s.
-    """
+    """Read counts (..., bins) of each block, and the duration of a bin, s."""
     sdtfile = import_file_reader("sdtfile", "tofclip[tcspc]")
     require_bounded_sdt(path)
     with BoundedFile(path) as opened, sdtfile.SdtFile(opened) as file:

@@ -477,9 +477,7 @@ def find_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4
 
 
 def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
-    """Return each point's surface normal, (n, 3), towards the camera, from a plane through at least
-    three neighbours.
-    """
+    """Return each point's normal, (n, 3), towards the camera, by three neighbours or more."""
     if len(cloud) < 3 or neighbours < 3:
         raise InputError("a normal needs at least three points and three neighbours")
     open3d = import_open3d()

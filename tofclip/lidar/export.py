@@ -99,9 +99,7 @@ def write_table(
 
 
 def list_columns(path: str | Path) -> Entries:
-    """List the columns of a table that `write_table` wrote, by their names without units; the first
-    that is loaded reads all.
-    """
+    """List a table's columns by their names without units; the first that is loaded reads all."""
     require_suffix(path, *FORMATS)
     lister = FORMATS[Path(path).suffix.lower()][1]
     with translate_read_errors(path):

@@ -301,9 +301,7 @@ def refine_returns(trace, times, background, curve, scale, estimate, variance, r
 
 @loop_part
 def check_overlap(estimate, k, curve, scale):
-    """Whether another return reaches return k (has light in bins that count for it), and the most bins
-    that one of them moved.
-    """
+    """Whether another return has light in bins of return k, and by how many bins one moved."""
     before = scale[1] / scale[0] + scale[3]
     after = (curve.shape[0] - 1 - scale[1]) / scale[0] - scale[2]
     crowded, moving = False, estimate[k, 4]
@@ -344,9 +342,7 @@ def sum_normal_equations(trace, times, background, curve, scale, estimate, k, cr
 
 @inlined
 def take_gauss_newton_step(times, sums, own):
-    """Improve one return's row of the estimate in place, by at most a bin; `sums` are those of
-    `sum_normal_equations`.
-    """
+    """Improve one return's row in place, by at most a bin; `sums` of `sum_normal_equations`."""
     pp, pd, dd, pr, dr = sums
     determinant = pp * dd - pd * pd
     own[4] = 0.0
@@ -381,9 +377,7 @@ def get_variance(variance, i, expected):
 
 @loop_part
 def find_pulse_window(times, near, arrival, scale):
-    """First bin and the bin after the last one that a return at `arrival` reaches, step by step from
-    the two bins `near` them.
-    """
+    """First bin, and the one after the last, of a return at `arrival`, from bins `near` them."""
     first, last = near
     while first > 0 and times[first - 1] >= arrival + scale[2]:
         first -= 1
@@ -398,9 +392,7 @@ def find_pulse_window(times, near, arrival, scale):
 
 @loop_part
 def interpolate_pulse(time, curve, scale):
-    """Pulse and its slope per second at `time`, s, after the arrival, by linear interpolation; zero
-    outside the samples.
-    """
+    """Pulse and its slope per second at `time`, s, after the arrival; zero outside the samples."""
     position = time * scale[0] + scale[1]
     if not 0 <= position < curve.shape[0] - 1:
         return 0.0, 0.0
@@ -463,9 +455,7 @@ def measure_returns(trace, times, background, noise, curve, scale, estimate, lea
 
 @search_step
 def list_returns(found, counts, pixel, values):
-    """List what was found in all pixels, in their order: its pixel, (n,), and the three values of each
-    return, (3, n).
-    """
+    """List the returns of all pixels, in order: pixel, (n,), and their three values, (3, n)."""
     listed = np.uintp(0)
     for p in range(counts.size):
         for k in range(counts[p]):

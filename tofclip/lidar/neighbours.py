@@ -268,9 +268,7 @@ def count_used_below(memory, limit):
 
 @fit_part
 def find_residuals_beside(memory, limit):
-    """The largest residual of those used that is at most `limit`, or 0, and the smallest above it, or
-    `FAR`.
-    """
+    """The largest used residual up to `limit`, or 0, and the smallest above it, or `FAR`."""
     used, residual = memory[USED], memory[RESIDUAL]
     most, zero = fill_vector(limit), fill_vector(np.float32(0))
     last, first = zero, fill_vector(np.float32(FAR))

@@ -163,9 +163,7 @@ class Pulse:
         return curve, (1 / self.spacing, self.origin, *self.extent(level))
 
     def extent(self, level: float) -> tuple[float, float]:
-        """Return when the curve first rises through `level` of its peak and last falls through it,
-        s after arrival.
-        """
+        """Return when the curve first rises and last falls through `level` of its peak, s."""
         above = np.flatnonzero(self.samples >= level)
         first, last = float(above[0]), float(above[-1])
         if above[0] > 0:

@@ -303,9 +303,7 @@ def keep_probable(returns: Returns, false_alarm: float | None = None) -> Returns
 
 
 def _holds_counts(frames: Frames, pulse: Pulse) -> bool:
-    """Whether frames are counted photons: whole numbers, some above one, on an even time axis that is
-    longer than a few pulses.
-    """
+    """Whether frames are counted photons: whole numbers on an even axis of several pulses."""
     if frames.camera.views > 1 or frames.measured.size or len(frames) < MIN_COUNTED_BINS:
         return False
     steps = np.diff(frames.times)

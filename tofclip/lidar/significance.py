@@ -234,9 +234,7 @@ def find_brightness(values: FloatArray) -> float:
 
 
 def find_brightness_at_instant(time: FloatArray, values: FloatArray, width: float) -> FloatArray:
-    """Return the brightness above which there is half of the light within about a pulse's `width`, s, of
-    each candidate's time.
-    """
+    """Return the brightness above which there is half of the light about that time."""
     slot = np.floor((time - time.min()) / width).astype(np.int64)
     order = np.argsort(slot, kind="stable")
     edges = np.searchsorted(slot[order], np.arange(int(slot.max()) + 2))

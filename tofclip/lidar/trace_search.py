@@ -86,9 +86,7 @@ class TraceSearch:
         self.set_least(np.zeros(number, np.float32))
 
     def set_least(self, least: Float32Array) -> None:
-        """Say which response of the matched filter, (bins,), a return must exceed to be of interest;
-        0 where nothing is known.
-        """
+        """Say which response, (bins,), a return must exceed to be of interest; 0: none is known."""
         lowest, gain = float(least.min()), self._limits.sharp_gain
         # None exceeds it where nothing is searched.
         of_interest = np.full(self._length + WORD_BINS, np.inf, np.float32)
@@ -174,9 +172,7 @@ def _place_vectors(sharp: Float32Array, searched: BoolArray) -> tuple[IntArray, 
 
 
 def _align(matched: Float32Array, length: int, width: int) -> tuple[Float32Array, IntArray]:
-    """The matched filters of all bins, (bins, width), each from a bin on that leaves room for its
-    vectors, and these bins.
-    """
+    """The matched filters, (bins, width), each from a bin that leaves room, and these bins."""
     number = matched.shape[1]
     first = np.arange(number) - len(matched) // 2
     starts = np.clip(first, 0, length - width)

@@ -338,9 +338,7 @@ class FocalStack:
         )
 
     def all_in_focus(self, depths: IntArray) -> AnyArray:
-        """Return the all-in-focus picture: each pixel from the picture whose number is in (rows,
-        columns) `depths`.
-        """
+        """Return each pixel from the picture whose number is in (rows, columns) `depths`."""
         require_shape("the map of depths", self.pictures.shape[1:], depths.shape)
         return np.take_along_axis(self.pictures, depths[np.newaxis], axis=0)[0]
 

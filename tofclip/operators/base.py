@@ -193,9 +193,7 @@ class Identity(LinearOperator):
 
 
 class Reshape(LinearOperator):
-    """The same values in another shape, such as the views of a light field one below the other as
-    one tall picture.
-    """
+    """The same values in another shape, such as the views of a light field as one tall picture."""
 
     portable = True
 
@@ -261,9 +259,7 @@ def estimate_squared_norm(operator: LinearOperator, iterations: int = 30, seed: 
 
 
 def _require_alike(what: str, operators: Sequence[LinearOperator], joined: int) -> LinearOperator:
-    """Return the first of operators whose shapes, but for the first `joined` axes of the result, and
-    types are one.
-    """
+    """Return the first of operators of one type, and one shape but for the `joined` axes."""
     require(operators, f"{what} needs at least one operator")
     first = operators[0]
     for other in operators[1:]:

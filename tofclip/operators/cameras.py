@@ -228,9 +228,7 @@ class EvenAngleLineCamera(LineCamera):
     name: ClassVar[str] = "line-even"
 
     def _assign_angles(self, angles: FloatArray) -> AngleAssignment:
-        """Deal evenly; directions that differ by 6 px at the picture's border stand for the
-        aperture together.
-        """
+        """Directions that differ by 6 px at the border stand for the aperture together."""
         neighbours = 4 * angles.size / max(self.image_shape)
         cycle = max(2, 1 << max(round(np.log2(neighbours)), 0))
         return assign_evenly(angles, self.views, cycle, np.random.default_rng(self.seed))
@@ -344,9 +342,7 @@ class AshokCamera(ApertureMaskCamera):
 
 
 class BabacanCamera(ApertureMaskCamera):
-    """Masks of random grey cells (S. D. Babacan et al., IEEE Trans. Image Process. 21, 4746
-    (2012)).
-    """
+    """Random grey cells (S. D. Babacan et al., IEEE Trans. Image Process. 21, 4746, 2012)."""
 
     name: ClassVar[str] = "babacan"
 
@@ -458,9 +454,7 @@ class PointSpreadCamera(LightFieldCamera):
 
 
 class CodedApertureCamera(PointSpreadCamera):
-    """A random mask of open and closed cells, one for each view. In focus (s = 0) nothing is
-    encoded.
-    """
+    """A random mask of open and closed cells, one for each view. In focus nothing is encoded."""
 
     name: ClassVar[str] = "coded-aperture"
 

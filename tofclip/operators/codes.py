@@ -63,9 +63,7 @@ class LinearShear(LinearOperator):
 
 
 class DenseSensor(Reshape):
-    """Every pixel of a plane of `plane_shape`, (int, int), is read, row by row; `dtype` float32 or
-    float64.
-    """
+    """Every pixel of a plane of `plane_shape` is read, row by row; `dtype` float32 or float64."""
 
     def __init__(self, plane_shape: tuple[int, int], dtype: DTypeLike = np.float32) -> None:
         super().__init__(plane_shape, (plane_shape[0] * plane_shape[1],), dtype)

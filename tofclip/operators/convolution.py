@@ -406,9 +406,7 @@ class MeasuredPointSpreads:
         self.stack = (spreads / light[:, np.newaxis, np.newaxis])[order]
 
     def interpolate(self, shear: float) -> FloatArray:
-        """Return the PSF at one depth, (rows, columns), linearly between the two nearest that were
-        measured.
-        """
+        """Return the PSF at one depth, linearly between the two nearest that were measured."""
         require(
             self.shears[0] <= shear <= self.shears[-1],
             f"shear {shear} lies beyond the measured {self.shears[0]:g} ... {self.shears[-1]:g}; "

@@ -128,9 +128,7 @@ FRACTION_MASK = (1 << FRACTION_BITS) - 1
 
 @inlined
 def _deposit_light(line, position, light, light_step):
-    """Share light between the bin of `position`, in column 0, and the next one, in column 1 of the
-    same row.
-    """
+    """Share light between the bin of `position`, column 0, and the next one, column 1 there."""
     first = np.uint64(position >> FRACTION_BITS)
     # The rest, not a product of its own: together the two are the light that came.
     beyond = line.dtype.type(position & FRACTION_MASK) * light_step
@@ -171,9 +169,7 @@ def project_onto_lines(picture, starts, rightward, downward, lines):
 
 @fast_loop
 def back_project_lines(lines, starts, rightward, downward, picture):
-    """The adjoint of `project_onto_lines` for lines (lines, bins) of one value a bin; overwrites
-    `picture`.
-    """
+    """The adjoint of `project_onto_lines`, for lines of one value a bin; overwrites `picture`."""
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
     for row in range(picture.shape[0]):
         picture[row] = 0

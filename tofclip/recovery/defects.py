@@ -244,9 +244,7 @@ def count_defects(streak: Streak, clipping: float) -> dict[str, Scalar]:
 
 
 def clip_from_below(streak: Streak, clipping: float) -> DataTermMaker:
-    """Return the data term of a streak image that is cut off at a level: least squares where that is
-    infinite.
-    """
+    """Return the data term of a streak image that is cut off at a level; infinite: nowhere."""
     if not np.isfinite(clipping):
         return LeastSquares
     limit = CLIPPED_FRACTION * (clipping - estimate_dark_level(streak.counts))

@@ -171,9 +171,7 @@ DEFAULT_FOCUS = FixedFocus()
 
 
 def parse_focus(text: str) -> Focus:
-    """Read a `text` ``depth-locked``, ``fixed:S`` or ``stack:S0:S1:N``; `InputError` for anything
-    else.
-    """
+    """Read a `text` ``depth-locked``, ``fixed:S`` or ``stack:S0:S1:N``; else `InputError`."""
     name, *numbers = text.split(":")
     try:
         if name == "depth-locked" and not numbers:
@@ -242,9 +240,7 @@ def fit_parallax_to_shot(
 
 
 def count_parallax_work(shot: Shot, shears: tuple[float, float, int]) -> int:
-    """Return how many frame iterations `fit_parallax_to_shot` reports at most for a `shot` and
-    `shears`: first, last and number.
-    """
+    """Return the frame iterations of `fit_parallax_to_shot`, at most, for `shot` and `shears`."""
     rows = shot.streak.counts.shape[0]
     fitting = count_registration_iterations() if shot.camera.sweep is None else 0
     return fitting + shears[2] * GATE_METHOD.work(rows)

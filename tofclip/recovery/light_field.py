@@ -248,9 +248,7 @@ class _InverseProblem:
 
 
 def _make_robust(method: ProximalMethod, problem: _InverseProblem) -> ProximalMethod:
-    """Return the method with Huber's term, its threshold from the errors that a narrow one leaves,
-    after least squares.
-    """
+    """Return the method with Huber's term, its threshold from the errors a narrow one leaves."""
     looking = method
     for _ in range(THRESHOLD_PASSES):
         seen = looking.recover(problem.model, problem.measurements).frames[0]
@@ -297,9 +295,7 @@ class AllInFocus:
     seconds: float
 
     def render_views(self, views: ArrayLike) -> LightField:
-        """Return what views, (views, 2) of (v, u) in view steps, see of it: each pixel is moved by its
-        own shear.
-        """
+        """Return what views, (views, 2) of (v, u), see of it: each pixel moves by its own shear."""
         wanted = np.asarray(views, np.float64)
         depths, labels = np.unique(self.shears, return_inverse=True)
         warp = make_view_warp(

@@ -475,9 +475,7 @@ def recover_glints(
     dazzled: BoolArray,
     device: ComputeDevice,
 ) -> Float32Array:
-    """Return frames that were recovered without dazzled measurements, (measurements, frames), with the
-    pixels that these alone see.
-    """
+    """Return frames recovered without dazzled measurements, with the pixels that only these see."""
     complete = frames.copy()
     for segment in segments:
         own = np.arange(dazzled.shape[1])[segment.frames]

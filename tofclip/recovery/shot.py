@@ -50,9 +50,7 @@ class Shot:
         return self.streak.times - self.camera.time_zero
 
     def merge_rows(self, number: int) -> Shot:
-        """Return this shot with so many successive rows added up in each; less than that are left out at
-        the end.
-        """
+        """Return this shot with so many successive rows added up in each; a rest is left out."""
         if number == 1:
             return self
         streak, camera = self.streak, self.camera

@@ -121,9 +121,7 @@ class PhotonPipeline:
     def for_shot(
         cls, shot: PhotonCube, camera: Path | Camera | None = None, time_zero: float | None = None
     ) -> PhotonPipeline:
-        """Prepare for shots like this one. The camera is by default the one that the shot carries, or
-        `Camera.pinhole`.
-        """
+        """Prepare for shots like this one; of no `camera` with its own, or `Camera.pinhole`."""
         known = Camera.load(camera) if isinstance(camera, Path) else camera or shot.camera
         photons, pulse = shot.to_image(), shot.pulse
         try:

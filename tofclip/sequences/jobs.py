@@ -201,9 +201,7 @@ def _version() -> str:
 
 @contextlib.contextmanager
 def _shield_children_from_interrupt() -> Iterator[None]:
-    """Keep processes started now from hearing Ctrl-C: a terminal sends it to all, and we end them
-    ourselves.
-    """
+    """Keep processes started now from hearing Ctrl-C, sent to all: we end them ourselves."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
@@ -363,9 +361,7 @@ def _run_on_cluster(jobs: Sequence[Job], cluster: str) -> Iterator[Report]:
 
 
 def _run_on_workers(client: Client, jobs: Sequence[Job], killers: list[Job]) -> Iterator[Report]:
-    """Do all jobs, and yield the reports as they come; `killers` gets those whose workers died too
-    often.
-    """
+    """Do all jobs; yield the reports as they come. `killers` gets those whose workers died."""
     from distributed import KilledWorker, as_completed
 
     waiting = iter(jobs)

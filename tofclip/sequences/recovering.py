@@ -70,9 +70,7 @@ class Shot:
 
 
 def is_sequence(source: str | Path) -> bool:
-    """Return whether `source` is a folder, a glob pattern or an HDF5 stack of streak images, and no
-    single file.
-    """
+    """Return whether `source` is a folder, a pattern or an HDF5 stack, and no single file."""
     text, path = str(source), Path(source)
     # The address of an instrument, which may hold characters that a pattern uses.
     if "://" in text:
@@ -230,9 +228,7 @@ class RecoverySettings:
 
 
 def normalise_device(device: str) -> str | None:
-    """Return the device as a setting that results depend on; the CPU is left out, as in
-    older folders.
-    """
+    """Return the device as a setting of results; the CPU is left out, as in older folders."""
     return None if device == str(CPU) else device
 
 
@@ -386,9 +382,7 @@ def write_cloud(clouds: CloudSettings, frames: Path, result: Path) -> int:
 
 
 def save_cloud(cloud: PointCloud, returns: Returns, path: Path, organised: bool = False) -> None:
-    """Write a cloud, a point for every pixel of an organised one, or the depth picture of its returns
-    where the name ends in .exr.
-    """
+    """Write a cloud, organised or not, or its returns' depth picture if the name ends in .exr."""
     if path.suffix.lower() == DEPTH_IMAGE_SUFFIX:
         from tofclip.lidar import save_depth
 
@@ -544,9 +538,7 @@ class JitterEstimator:
 
 
 def compute_light_curve(streak: Streak, camera: Camera) -> FloatArray:
-    """Sum of each raw row, counts, over the reference view's middle, where neighbouring views' skew
-    does not matter.
-    """
+    """Sum of each raw row over the reference view's middle, where skew does not matter."""
     reference = int(np.argmin(np.abs(camera.view_positions)))
     # the middle half of one view, which neighbours do not reach
     half = camera.image_shape[1] // 4
@@ -582,9 +574,7 @@ def make_average_cloud(
 
 
 def _differentiate_root(light: FloatArray) -> FloatArray:
-    """Changes of the root of the light: near objects outshine far ones, and a constant says
-    nothing.
-    """
+    """Changes of the root: near objects outshine far ones, and a constant says nothing."""
     # Shot noise of a root of counts is the same at every level, so that no row dominates.
     rise = np.diff(np.sqrt(np.maximum(light - np.median(light), 0)), prepend=0.0)
     length = float(np.linalg.norm(rise)) or 1.0

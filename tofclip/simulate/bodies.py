@@ -100,9 +100,7 @@ class Sphere(Shape):
 
 @dataclass(frozen=True)
 class Box(Shape):
-    """A block with the whole pattern on each face; `width`, `height` and `thickness` along x, y and
-    z, m.
-    """
+    """A block with the pattern on each face; `width`, `height` and `thickness` along x, y, z, m."""
 
     width: float
     height: float
@@ -201,9 +199,7 @@ class Body:
     axes: AnyArray = field(default_factory=lambda: np.eye(3))
 
     def intersect(self, origin: AnyArray, directions: AnyArray) -> Hits:
-        """Return where rays meet the body, holes of whose pattern let them pass; see
-        `Shape.intersect`.
-        """
+        """Return where rays meet the body, holes let them pass; see `Shape.intersect`."""
         found = self.shape.intersect((origin - self.centre) @ self.axes, directions @ self.axes)
         solid = np.isfinite(self.material.reflectance(found.pattern_position))
         return Hits(
@@ -239,16 +235,12 @@ class Body:
         return self._turn(np.diag([-1.0, 1.0, 1.0]))
 
     def rotate(self, angle: float) -> Body:
-        """Return the body turned clockwise, as seen, about its middle and the line of sight;
-        `angle` in rad.
-        """
+        """Return the body turned clockwise, as seen, about the line of sight; `angle` in rad."""
         cosine, sine = np.cos(angle), np.sin(angle)
         return self._turn([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
     def tilt(self, angle: float) -> Body:
-        """Return the body turned about the upright line through its middle, its right side away;
-        `angle` in rad.
-        """
+        """Return the body turned about its upright, its right side away; `angle` in rad."""
         cosine, sine = np.cos(angle), np.sin(angle)
         return self._turn([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
 
@@ -270,9 +262,7 @@ class FirstHits(Hits):
 
 
 def cast_rays(bodies: Sequence[Body], origin: AnyArray, directions: AnyArray) -> FirstHits:
-    """Follow rays from (3,) `origin`, m, along (rays, 3) `directions`, all with z > 0, to the nearest
-    surface.
-    """
+    """Follow rays from `origin` along (rays, 3) `directions`, z > 0, to what is nearest."""
     count = len(directions)
     nearest, number = np.full(count, np.inf), np.full(count, NO_BODY, np.intp)
     normal, place = np.zeros((count, 3)), np.zeros((count, 2))
@@ -316,9 +306,7 @@ def compute_irradiance(
 
 
 def number_ray_pixels(image_shape: tuple[int, int], rays_per_side: int) -> IndexArray:
-    """Return the raster number of the pixel to which each ray belongs, in raster order of rays over
-    the whole picture.
-    """
+    """Return the raster number of each ray's pixel, in raster order of rays over the picture."""
     numbers = np.arange(int(np.prod(image_shape))).reshape(image_shape)
     return numbers.repeat(rays_per_side, axis=0).repeat(rays_per_side, axis=1).ravel()
 

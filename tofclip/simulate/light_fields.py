@@ -66,15 +66,11 @@ class CameraArray:
         return np.stack(np.meshgrid(*numbers, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def position(self, view: View) -> FloatArray:
-        """Where the camera at (v, u) stands, (x, y, z) in metres; fractions are places between the
-        array's.
-        """
+        """Where the camera at (v, u), which may be fractions, stands, (x, y, z) in metres."""
         return np.array([view[1] * self.view_step, view[0] * self.view_step, 0.0])
 
     def shear(self, depth: ArrayLike) -> FloatArray:
-        """Shear s in pixels per view step of points at `depth` metres along z (supplement Note 1, s
-        = 0 at focus).
-        """
+        """Shear of points at `depth` metres along z, pixels per view step (supplement Note 1)."""
         nearness = 1 / self.focus - 1 / np.asarray(depth, np.float64)
         return np.asarray(self.focal_length_px * self.view_step * nearness)
 
@@ -158,9 +154,7 @@ def _for_each_view(
 
 
 def render_view(scene: Scene, array: CameraArray, view: View) -> AnyArray:
-    """Return what the camera at (v, u) sees, (rows, columns) float32; fractions are cameras between
-    the array's.
-    """
+    """Return what the camera at (v, u) sees, (rows, columns) float32; v and u may be fractions."""
     origin, directions = array.rays(view, array.samples)
     _, brightness = _shade_rays(scene, origin, directions)
     rows, columns = array.image_shape
@@ -230,9 +224,7 @@ class TimeAxis:
 
     @classmethod
     def for_ranges(cls, near: float, far: float, bin_width: float, pulse_fwhm: float) -> TimeAxis:
-        """Return a time axis for surfaces from `near` to `far` metres away, lamps beside the views;
-        `bin_width` and `pulse_fwhm` in s.
-        """
+        """Return an axis for surfaces from `near` to `far`, m; widths of bins and pulse in s."""
         start = 2 * near / SPEED_OF_LIGHT
         bins = int(np.ceil(2 * (far - near) / SPEED_OF_LIGHT / bin_width)) + 1
         return cls(start, bin_width, bins, pulse_fwhm)

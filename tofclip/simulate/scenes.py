@@ -42,9 +42,7 @@ BLACK_MATERIAL = Lambertian(make_plain_pattern(0.0))
 
 @dataclass(frozen=True)
 class _SceneBuilder:
-    """Places bodies by what the reference view should see: pixels right and down of the centre, and
-    a shear.
-    """
+    """Places bodies by what the reference view sees: pixels from the centre, and a shear."""
 
     array: CameraArray
 

@@ -225,9 +225,7 @@ class Instrument:
         return np.array([self.camera.lenslet_pitch * position, 0.0, 0.0])
 
     def pixel_grid(self) -> tuple[FloatArray, FloatArray]:
-        """Rays of a picture: X and Y from the optical axis in pixels, flat, sub-pixel by sub-pixel
-        in raster order.
-        """
+        """X and Y of a picture's rays from the optical axis, in pixels, flat, in raster order."""
         side, camera = self.rays_per_pixel_side, self.camera
         # Middles of the sub-pixels; pixel centres are whole numbers, hence the half taken off.
         down, across = (
@@ -575,9 +573,7 @@ def place_plate(
     pitch: float = 0.0,
     focal_length_px: float = FOCAL_LENGTH_PX,
 ) -> Body:
-    """Square plate that appears around pixel offset `middle_px` (x, y) from the optical axis,
-    `side_px` wide.
-    """
+    """Square plate `side_px` wide around pixel offset `middle_px` (x, y) from the optical axis."""
     pixel = depth / focal_length_px
     centre: Vector = (middle_px[0] * pixel, middle_px[1] * pixel, depth)
     return make_plate(centre, (side_px * pixel, side_px * pixel), pattern, yaw, pitch)

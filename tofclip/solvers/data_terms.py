@@ -49,9 +49,7 @@ class DataTerm(ABC):
 
     @abstractmethod
     def weights(self, predicted: Array) -> Array:
-        """Return between 0 and 1 what each measurement's residual counts at `predicted`,
-        (measurements, frames).
-        """
+        """Return from 0 to 1 what each measurement's residual counts at `predicted`."""
 
     def gradient(self, predicted: Array) -> Array:
         """Return the derivative with respect to `predicted`, same shape."""
@@ -87,9 +85,7 @@ class _SquaredNearZero(DataTerm):
 
 
 class LeastSquares(_SquaredNearZero):
-    """``1/2 |W (predicted - measurements)|^2`` for each frame, W = 0 or 1: right for even, Gaussian
-    errors.
-    """
+    """``1/2 |W (predicted - measurements)|^2``, W = 0 or 1: right for even, Gaussian errors."""
 
     def value(self, predicted: Array) -> Array:
         return 0.5 * sum_squares(self.gradient(predicted))

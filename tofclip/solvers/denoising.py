@@ -31,9 +31,7 @@ alike in a pilot, a cleaner estimate of the same picture.
 
 @dataclass(frozen=True)
 class NonlocalMeans:
-    """Means over patches that look alike (scikit-image). A. Buades, B. Coll, J.-M. Morel, CVPR
-    2005, 60.
-    """
+    """Means over patches that look alike (A. Buades, B. Coll, J.-M. Morel, CVPR 2005, 60)."""
 
     patch_px: int = 5  # side of a patch
     reach_px: int = 10  # how far away patches are looked for, each way

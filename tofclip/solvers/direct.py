@@ -125,9 +125,7 @@ class PreparedInverse:
         return PerDevice(partial(ComputeDevice.put, values=self.inverse_gram))
 
     def recover(self, measurements: Array, progress: Progress = ignore_progress) -> Result:
-        """Recover one picture per column of `measurements` (measurements, frames), where they are;
-        see `Method.recover`.
-        """
+        """Recover a picture per column of `measurements`, with `progress`; see `Method.recover`."""
         measurements = validate_measurements(self.operator, measurements, None)
         blocks = Blocks(self.operator, measurements)
         weights = self.weights(measurements) if is_numpy(measurements) else None
@@ -195,9 +193,7 @@ class Backprojection(Method):
 
 
 def _fit_scale(operator: LinearOperator, measurements: Array) -> float:
-    """The factor c that minimises ``|c A A'f - f|`` over the brightest frames, in which signal
-    outweighs noise.
-    """
+    """The c that minimises ``|c A A'f - f|`` over the brightest frames: signal, not noise."""
     xp = namespace(measurements)
     order = xp.argsort(xp.sum(measurements * measurements, axis=0))
     block = xp.take(measurements, order[-min(LANES, measurements.shape[1]) :], axis=1)

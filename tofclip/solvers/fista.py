@@ -370,9 +370,7 @@ class TotalVariation(ProximalMethod):
 
 @dataclass(frozen=True)
 class LightFieldVariation(ProximalMethod):
-    """Nonnegative light fields with sharp borders, their views alike (4D total variation;
-    supplement Eq. 20).
-    """
+    """Nonnegative light fields with sharp borders, views alike (4D total variation; Eq. 20)."""
 
     weight: float = 1e-2
     iterations: int = 200

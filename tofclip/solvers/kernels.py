@@ -193,9 +193,7 @@ def _make_primal_row(lanes, noisy, weight, down, above, across, result):
 
 @row_part
 def _update_dual_row(lanes, here, below, sweep, down, across, shrink):
-    """``dual = project(dual + sweep * grad(picture))`` onto vectors of length at most 1; `shrink` is
-    room for a row.
-    """
+    """Projects ``dual + sweep * grad(picture)`` onto length 1 at most; `shrink`: room for a row."""
     one, step = np.float32(1), np.uintp(lanes)
     end = np.uintp(here.size)
     # The last pixel of a row has no right neighbour: its difference across is 0, and so is the dual
@@ -268,9 +266,7 @@ def _make_light_field_row(lanes, noisy, weight, down, above, across, angular, be
 
 @fast_loop
 def update_light_field_dual(lanes, field, dual, step, angular, square):
-    """``dual = project(dual + step * grad(field))`` onto vectors of length at most 1; `square` is room
-    for a row.
-    """
+    """Projects ``dual + step * grad(field)`` onto length 1 at most; `square`: room for a row."""
     down, across, rows, end = field.shape
     inner = end - lanes
     for v in range(down):

@@ -114,9 +114,7 @@ class IterativeSolver(Protocol):
         ...
 
     def duality_gap(self) -> Array | None:
-        """Return how far each frame's objective is above the least one at most, where that is
-        known.
-        """
+        """Return how far each frame is above the least objective at most, where that is known."""
         ...
 
 
@@ -308,9 +306,7 @@ def relative_residual(
 
 
 def validate_measurements(operator: LinearOperator, measurements: Array, valid: Mask) -> Array:
-    """Return (measurements, frames) values contiguous and in the operator's type, refusing wrong
-    shapes, NaN and infinity.
-    """
+    """Return (measurements, frames), contiguous, in the operator's type; refuse NaN."""
     xp = namespace(measurements) if valid is None else namespace(measurements, valid)
     if measurements.ndim != 2 or measurements.shape[:1] != operator.shape_out:
         expected = f"({operator.shape_out[0]}, frames)"
@@ -331,9 +327,7 @@ WORKING_PICTURES = 16
 
 
 def frames_per_block(operator: LinearOperator, measurements: Array) -> int:
-    """`LANES` for NumPy's (measurements, frames), or one if it is alone; for others as many as
-    `WORKING_BYTES` hold.
-    """
+    """`LANES` for NumPy's, or 1 of a lone frame; of others as many as `WORKING_BYTES` hold."""
     if is_numpy(measurements):
         return LANES if measurements.shape[1] > 1 else 1
     picture = prod(operator.shape_in) * operator.dtype.itemsize

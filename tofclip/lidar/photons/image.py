@@ -226,9 +226,7 @@ class PhotonImage:
         return replace(self, offsets=offsets, bin=self.bin[kept], count=count[kept], axes="")
 
     def join_bins(self, number: int) -> PhotonImage:
-        """Return the same events, at the same instants, on a time axis of bins that are as many
-        times as long.
-        """
+        """Return the same events, at the same instants, in bins a `number` of times as long."""
         if number == 1:
             return self
         # A bin's middle is its instant: half of the first new bin lies before the record.
@@ -296,9 +294,7 @@ class PhotonImage:
         return SPEED_OF_LIGHT / 2 * self.bin_width * usual
 
     def add_bin_errors(self, layers: FloatArray) -> FloatArray:
-        """Add what is not known of the bins' instants to the deviations of layers, (..., 4) as of
-        `SurfaceImage.from_layers`.
-        """
+        """Add what is not known of bins' instants to the deviations of `layers` (..., 4)."""
         if self.bin_sigma is None:
             return layers
         bin_m = SPEED_OF_LIGHT / 2 * self.bin_width
@@ -419,9 +415,7 @@ def find_dim_pixels(photons: PhotonImage) -> BoolArray:
 
 
 def _rank_neighbours(values: FloatArray, rank: int) -> FloatArray:
-    """Value of that rank among each pixel's eight neighbours, of a line the eight along it; of a lone
-    pixel its own.
-    """
+    """Value of that rank among each pixel's eight neighbours, of a line along it."""
     if values.size == 1:
         return values
     line = np.where(np.array(values.shape) > 1, 9, 1)

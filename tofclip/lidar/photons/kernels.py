@@ -467,9 +467,7 @@ def tally_first_photons(
 
 @compiled
 def choose_cycles(offsets, count, cycles, fraction, noise, chosen):
-    """Fill `chosen` (events,) with the photons of a fraction of the cycles, each of which counted one
-    or none.
-    """
+    """Fill `chosen` (events,) with the photons of a fraction of the cycles, one or none in each."""
     for pixel in range(offsets.size - 1):
         left, needed = cycles, np.floor(fraction * cycles + noise.random())
         for event in range(offsets[pixel], offsets[pixel + 1]):

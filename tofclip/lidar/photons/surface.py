@@ -202,9 +202,7 @@ class SurfaceSearch:
     to_probability: Callable[[Float32Array], FloatArray]  # of an outlier, from a label's margin
 
     def locate(self, photons: PhotonImage) -> FloatArray:
-        """Find the strongest surface, (rows, columns, 4): instant and deviation in bins, photons, and
-        probability of an outlier.
-        """
+        """Find the strongest surface, (rows, columns, 4), instant and deviation in bins."""
         scene, reach, width = self.scene, self.reach, self.scene.response.width
         surface, margin = match_photons(photons, scene, self.axis, self.slope_cost)
         # labels of a gate that is open for many steps are further off than its edges are steep
@@ -245,9 +243,7 @@ class SurfaceSearch:
 def choose_slope_cost(
     train: PhotonImage, test: PhotonImage, scene: Scene, axis: LabelAxis
 ) -> tuple[float, FloatArray, Float32Array]:
-    """Find the cost of a change by one label that explains the photons held back best, and what
-    `match_labels` gives with it.
-    """
+    """Find the cost that explains the photons held back best, and what `match_labels` gives."""
     score, trials = compute_scores(train, scene, axis), []
     for cost in SLOPE_COSTS:
         surface, margin = match_labels(score, axis, train.image_shape, cost)
@@ -323,9 +319,7 @@ def learn_scene(
 def choose_reach(
     train: PhotonImage, test: PhotonImage, scene: Scene, surface: FloatArray
 ) -> tuple[int, FloatArray]:
-    """Find the reach of planes, in pixels, that explains the photons held back best, and what
-    `fit_surface` gives with it.
-    """
+    """Find the reach that explains the photons held back best, and what `fit_surface` gives."""
     best, chosen, highest = REACHES_PX[0], np.zeros(0), -np.inf
     rounds = PLANE_ROUNDS
     for reach in REACHES_PX:
@@ -441,9 +435,7 @@ def compare_with_background(
 
 
 def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> PhotonImage:
-    """Leave out the photons that a surface, the first of a `layer`'s numbers, explains better than the
-    background does.
-    """
+    """Leave out the photons that a surface, the first of a `layer`'s numbers, explains better."""
     response = scene.response
     bright = response.times[response.density >= MIN_EXPLAINED_DENSITY * response.density.max()]
     late = photons.times_after(layer[..., 0])
