@@ -33,12 +33,10 @@ from tofclip.storage import (
     is_stand_in,
     read_outline,
     stored_array,
-    stored_attachments,
     stored_child,
+    stored_mapping,
     stored_origin,
     stored_part,
-    stored_provenance,
-    stored_texts,
     stored_value,
 )
 
@@ -454,10 +452,10 @@ class Whole(Storable):
     other: Part | None = field(
         default=None, metadata=stored_child(Part.from_record, "part", optional=True)
     )
-    texts: Mapping[str, str] = field(default_factory=dict, metadata=stored_texts())
-    attachments: Mapping[str, Record] = field(default_factory=dict, metadata=stored_attachments())
+    texts: Mapping[str, str] = stored_mapping("texts")
+    attachments: Mapping[str, Record] = stored_mapping("attachments")
     source: str = field(default="nowhere", metadata=stored_origin())
-    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+    provenance: Mapping[str, Any] = stored_mapping("provenance")
 
 
 class TestDeclaredFields:

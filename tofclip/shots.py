@@ -38,12 +38,9 @@ from tofclip.storage import (
     Storable,
     make_stand_in,
     stored_array,
-    stored_attachments,
-    stored_attributes,
     stored_child,
+    stored_mapping,
     stored_origin,
-    stored_provenance,
-    stored_texts,
 )
 from tofclip.units import SPEED_OF_LIGHT, require_credible_bin_width
 
@@ -94,13 +91,13 @@ class Streak(Storable):
     saturated: BoolArray | None = field(
         default=None, metadata=stored_array("", "time", "column", dtype=bool, optional=True)
     )
-    metadata: Mapping[str, str] = field(default_factory=dict, metadata=stored_texts())
+    metadata: Mapping[str, str] = stored_mapping("texts")
     camera: Camera | None = field(
         default=None, metadata=stored_child(Camera.from_record, optional=True)
     )
-    attachments: Mapping[str, Record] = field(default_factory=dict, metadata=stored_attachments())
+    attachments: Mapping[str, Record] = stored_mapping("attachments")
     source: str = field(default="streak image", metadata=stored_origin())
-    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+    provenance: Mapping[str, Any] = stored_mapping("provenance")
 
     def __post_init__(self) -> None:
         with np.errstate(over="ignore"):  # too large becomes infinite, which is refused below
@@ -253,7 +250,7 @@ class Returns(Storable):
     return_number: NDArray[np.uint8] = field(metadata=stored_array("", "return", dtype=np.uint8))
     time: FloatArray = field(metadata=stored_array("s", "return"))
     camera: Camera = field(metadata=stored_child(Camera.from_record, "camera"))
-    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+    provenance: Mapping[str, Any] = stored_mapping("provenance")
     shear: FloatArray = empty_array("px", "return", optional=True)
     false_alarm: FloatArray = empty_array("", "return", optional=True)
 
@@ -380,9 +377,9 @@ class Frames(Storable):
     values: Array = field(metadata=stored_array("count", "time", "y", "x", dtype=np.float32))
     times: FloatArray = field(metadata=stored_array("s", "time"))
     camera: Camera = field(metadata=stored_child(Camera.from_record, "camera"))
-    figures: Mapping[str, Scalar] = field(default_factory=dict, metadata=stored_attributes())
-    attachments: Mapping[str, Record] = field(default_factory=dict, metadata=stored_attachments())
-    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+    figures: Mapping[str, Scalar] = stored_mapping("attributes")
+    attachments: Mapping[str, Record] = stored_mapping("attachments")
+    provenance: Mapping[str, Any] = stored_mapping("provenance")
     shears: FloatArray = empty_array("px", "time", optional=True)
     returns: Returns | None = field(
         default=None, metadata=stored_child(Returns.from_record, "returns", optional=True)

@@ -386,24 +386,12 @@ def stored_child(read: Callable[[Record], Any], kind: str = "", optional: bool =
     return _declare("child", read=read, record_kind=kind, optional=optional)
 
 
-def stored_attributes() -> Metadata:
-    """Declare a mapping that makes up all attributes of the record."""
-    return _declare("attributes")
-
-
-def stored_texts() -> Metadata:
-    """Declare a mapping of str to str, stored as a child record of its own."""
-    return _declare("texts")
-
-
-def stored_attachments() -> Metadata:
-    """Declare a mapping of all child records that no other field declares."""
-    return _declare("attachments")
-
-
-def stored_provenance() -> Metadata:
-    """Declare the mapping that says how the object came about."""
-    return _declare("provenance")
+def stored_mapping(what: str) -> Any:
+    """Return the field of a mapping, empty by default: all ``"attributes"`` of the record; ``"texts"``, a
+    child record of its own; ``"attachments"``, all child records that no other field declares; or
+    ``"provenance"``, how the object came about.
+    """
+    return field(default_factory=dict, metadata=_declare(what))
 
 
 def stored_origin() -> Metadata:

@@ -33,7 +33,7 @@ from tofclip.storage import (
     make_stand_in,
     read_outline,
     stored_array,
-    stored_provenance,
+    stored_mapping,
 )
 from tofclip.units import MAD_TO_SIGMA, SPEED_OF_LIGHT
 
@@ -107,7 +107,7 @@ class PointCloud(Storable):
     range: Float32Array = field(metadata=_column("range"))
     return_number: NDArray[np.uint8] = field(metadata=_column("return_number", np.uint8))
     time: Float32Array = field(metadata=_column("time"))
-    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+    provenance: Mapping[str, Any] = stored_mapping("provenance")
     false_alarm: Float32Array = field(
         default_factory=lambda: np.empty(0, np.float32), metadata=_column("false_alarm")
     )

@@ -33,8 +33,8 @@ from tofclip.operators.sparse import SparseMatrix
 from tofclip.storage import (
     Storable,
     stored_array,
+    stored_mapping,
     stored_part,
-    stored_provenance,
     stored_value,
 )
 
@@ -206,7 +206,7 @@ class ClipMeasurement(Storable):
     # what a measurement of 1 means in counted photons; 0: not known
     photons_per_unit: float = field(default=0.0, metadata=stored_value())
     # how they came about
-    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+    provenance: Mapping[str, Any] = stored_mapping("provenance")
 
     def __post_init__(self) -> None:
         require(np.all(np.isfinite(self.values)), "the measurements hold NaN or infinity")
