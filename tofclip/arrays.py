@@ -163,11 +163,6 @@ class ComputeDevice:
             return cls()
         return cls(_library_name(array), native_device(array))
 
-    @property
-    def has_compiled_loops(self) -> bool:
-        """Whether this package's compiled loops work on arrays from here."""
-        return self.library == "numpy"
-
     def put(self, values: Array) -> Array:
         """Return `values`, of any library, as an array that lives here, with the type they have."""
         if self.library == "numpy":

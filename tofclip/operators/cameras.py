@@ -65,6 +65,7 @@ class LightFieldCamera(ABC):
     """
 
     name: ClassVar[str]
+    joined: ClassVar[type[BlockDiagonal | Integration]] = BlockDiagonal  # apart, or on one sensor
     measurements: int
     # consecutive measurements on a detector whose errors are alike; 1 where each stands for itself
     correlation_length: int = 1
@@ -98,7 +99,7 @@ class LightFieldCamera(ABC):
 
     def light_field_model(self) -> LinearOperator:
         """Return the map from the used views' pictures to the measurements (Eq. 20)."""
-        return BlockDiagonal(self.encoders)
+        return self.joined(self.encoders)
 
 
 # Neighbours on a line detector whose errors are alike: what is out of focus is some ten pixels wide. A
@@ -278,6 +279,8 @@ class CompressiveCamera(LightFieldCamera):
     ratio is the number of exposures, a whole number.
     """
 
+    joined = Integration
+
     def _assign_measurements(self) -> tuple[int, ...]:
         self.exposures = round(self.sampling_ratio)
         require(
@@ -287,9 +290,6 @@ class CompressiveCamera(LightFieldCamera):
         )
         self.measurements = self.exposures * self.image_shape[0] * self.image_shape[1]
         return tuple(range(len(self.views)))
-
-    @abstractmethod
-    def light_field_model(self) -> LinearOperator: ...
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): the light field's model after the shears."""
@@ -377,9 +377,6 @@ class MarwahCamera(CompressiveCamera):
         sensor = DenseSensor(self.image_shape)
         return tuple(sensor @ Diagonal(code) for code in self.codes())
 
-    def light_field_model(self) -> LinearOperator:
-        return DenseSensor(self.image_shape) @ Integration([Diagonal(one) for one in self.codes()])
-
 
 class SinglePixelCamera(LightFieldCamera):
     """CLIP-0D: as many random 0/1 codes for each view (supplement Note 6)."""
@@ -419,6 +416,8 @@ class PointSpreadCamera(LightFieldCamera):
     sampling ratio asks for.
     """
 
+    joined = Integration
+
     @abstractmethod
     def make_element(self) -> ApertureElement:
         """Return what stands in the aperture."""
@@ -435,11 +434,8 @@ class PointSpreadCamera(LightFieldCamera):
 
     @cached_property
     def encoders(self) -> tuple[LinearOperator, ...]:
-        return tuple(self.sensor @ one for one in self._convolutions)
-
-    @property
-    def _convolutions(self) -> list[PointSpreadConvolution]:
-        return [PointSpreadConvolution(self.image_shape, spread) for spread in self._spreads]
+        convolutions = (PointSpreadConvolution(self.image_shape, one) for one in self._spreads)
+        return tuple(self.sensor @ one for one in convolutions)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): one convolution with the depth's PSF, read by the sensor."""
@@ -447,10 +443,6 @@ class PointSpreadCamera(LightFieldCamera):
         # views are moved by the shear and add up on the sensor: one convolution (Eq. 5)
         spread = shear_point_spreads(self._spreads, views, shear, reference).sum(axis=0)
         return self.sensor @ PointSpreadConvolution(self.image_shape, spread)
-
-    def light_field_model(self) -> LinearOperator:
-        """Return the sum of what the used views put on the sensor."""
-        return self.sensor @ Integration(self._convolutions)
 
 
 class CodedApertureCamera(PointSpreadCamera):

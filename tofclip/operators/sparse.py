@@ -65,7 +65,7 @@ def make_product(matrix: scipy.sparse.csr_array, device: ComputeDevice) -> Produ
     PyTorch and CuPy have such products, by the maker of the device (cuSPARSE, MKL); any other
     library gathers a row's entries and sums them.
     """
-    if device.has_compiled_loops:
+    if device.library == "numpy":
         return partial(_multiply_tiles, Tiles.from_csr(matrix))
     if device.library == "torch":
         import torch
