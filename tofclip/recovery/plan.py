@@ -41,20 +41,28 @@ from tofclip.recovery.defects import (
     find_clipping_level,
     list_noise_figures,
 )
-from tofclip.recovery.focus import DEFAULT_FOCUS, DepthLockedFocus, Focus, FrameSegment, parse_focus
-from tofclip.recovery.shot import Shot, count_needless_rows, open_shot
+from tofclip.recovery.shot import (
+    DEFAULT_FOCUS,
+    DepthLockedFocus,
+    Focus,
+    FrameSegment,
+    Shot,
+    count_needless_rows,
+    open_shot,
+    parse_focus,
+)
 from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.shots import RELAY_WALL, Frames, Streak
 from tofclip.solvers import (
     DataTermMaker,
+    IterationHistory,
     LeastSquares,
     Method,
     Progress,
     Result,
     ignore_progress,
-    relative_residual,
 )
-from tofclip.solvers.methods import frames_per_block
+from tofclip.solvers.methods import frames_per_block, sum_residual
 from tofclip.storage import Scalar, collect_provenance
 from tofclip.threads import split_blocks, thread_count
 
@@ -431,39 +439,29 @@ def recover_segments(
     return _join_results(frames, results)
 
 
-def _zero_invalid(part: Measurement) -> Array:
-    return namespace(part.values, part.valid).where(part.valid, part.values, 0.0)
-
-
 def _find_peak(camera: Camera, measurement: Measurement, segment: FrameSegment) -> float:
     """Largest value of F'f over a segment's valid measurements."""
     operator = camera.operator(segment.shear)
-    measurements = _zero_invalid(measurement.select(segment.frames))
-    xp = namespace(measurements)
+    part = measurement.select(segment.frames)
+    xp = namespace(part.values, part.valid)
+    measurements = xp.where(part.valid, part.values, 0.0)
     blocks = split_blocks(measurements.shape[1], frames_per_block(operator, measurements))
     return max(float(xp.max(operator.adjoint(measurements[:, block]))) for block in blocks)
 
 
 def _join_results(frames: Array, results: list[Result]) -> Result:
-    """Join what is known about the segments; those that stopped early count with their last
-    objective, and the duality gap is a fraction of all objectives, NaN where one has none.
-    """
-    longest = max(result.objective.size for result in results)
-    objective, excess, whole = np.zeros(longest), 0.0, 0.0
-    for result in results:
-        last = result.objective[-1] if result.objective.size else np.nan
-        excess, whole = excess + result.duality_gap * last, whole + last
-        if result.objective.size:
-            objective += np.pad(result.objective, (0, longest - result.objective.size), "edge")
-    reasons = {result.stop_reason for result in results}
-    return Result(
-        frames,
-        max(result.iterations for result in results),
-        objective,
-        "iterations done" if "iterations done" in reasons else results[0].stop_reason,
-        sum(result.setup_seconds for result in results),
-        float(excess / whole) if whole > 0 else float("nan"),
-    )
+    """Join what is known about the segments, as about a method's own blocks."""
+    setup_seconds = sum(one.setup_seconds for one in results)
+    if not results[0].objective.size:
+        return Result(frames, setup_seconds=setup_seconds)
+    histories = [
+        IterationHistory(one.objective, False, one.duality_gap * one.objective[-1])
+        for one in results
+    ]
+    reasons = {one.stop_reason for one in results}
+    reason = "iterations done" if "iterations done" in reasons else results[0].stop_reason
+    joined = Result.from_blocks(frames, histories, setup_seconds)
+    return replace(joined, stop_reason=reason)
 
 
 def recover_glints(
@@ -493,13 +491,9 @@ def compute_segments_residual(
     camera: Camera, frames: Array, measurement: Measurement, segments: Sequence[FrameSegment]
 ) -> float:
     """Return ``|F h - f| / |f|`` over all valid measurements, each frame with its own operator."""
-    misfit = energy = 0.0
+    sums = []
     for segment in segments:
-        part = measurement.select(segment.frames)
-        xp = namespace(part.values)
-        own = float(xp.sum(_zero_invalid(part) ** 2, dtype=xp.float64))
-        if own > 0:
-            operator, pictures = camera.operator(segment.shear), frames[segment.frames, ...]
-            left = relative_residual(operator, pictures, part.values, part.valid)
-            misfit, energy = misfit + own * left**2, energy + own
+        part, operator = measurement.select(segment.frames), camera.operator(segment.shear)
+        sums.append(sum_residual(operator, frames[segment.frames, ...], part.values, part.valid))
+    misfit, energy = np.sum(sums, axis=0)
     return float(np.sqrt(misfit / energy))

@@ -292,7 +292,17 @@ def relative_residual(
     `valid`, of all `frames` (frames, rows, columns), by their `operator`. `InputError` where
     every valid measurement is zero.
     """
-    # Block by block: predictions of all frames at once would double the memory.
+    misfit, energy = sum_residual(operator, frames, measurements, valid)
+    require(energy != 0, "every valid measurement is zero; there is nothing to compare with")
+    return float(np.sqrt(misfit / energy))
+
+
+def sum_residual(
+    operator: LinearOperator, frames: Array, measurements: Array, valid: Mask
+) -> tuple[float, float]:
+    """Squares of what is left of the valid measurements, and of these, block by block: predictions of
+    all frames at once would double the memory.
+    """
     misfit = energy = 0.0
     xp = namespace(frames, measurements)
     for piece in split_blocks(frames.shape[0], frames_per_block(operator, measurements)):
@@ -301,8 +311,7 @@ def relative_residual(
         residual = (operator(xp.moveaxis(frames[piece, ...], 0, -1)) - seen) * mask
         misfit += float(xp.sum(residual**2, dtype=xp.float64))
         energy += float(xp.sum((seen * mask) ** 2, dtype=xp.float64))
-    require(energy != 0, "every valid measurement is zero; there is nothing to compare with")
-    return float(np.sqrt(misfit / energy))
+    return misfit, energy
 
 
 def validate_measurements(operator: LinearOperator, measurements: Array, valid: Mask) -> Array:
