@@ -17,7 +17,7 @@ from tofclip.errors import InputError, require, require_known
 from tofclip.files import atomic_path, read_toml, suggest_name
 from tofclip.operators import LinearOperator
 from tofclip.operators.cameras import CAMERAS, LightFieldCamera
-from tofclip.recovery.focus import DepthLockedFocus, FixedFocus, FrameSegment
+from tofclip.recovery.shot import DepthLockedFocus, FixedFocus, FrameSegment
 from tofclip.shots import Frames
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate
 from tofclip.simulate.patterns import (
@@ -93,7 +93,9 @@ class Design:
             self.near_m < self.far_m,
             f"far_m must be more than near_m, {self.near_m:g}; got {self.far_m:g}",
         )
-        span = 2 * (self.far_m - self.near_m) * self._secant / SPEED_OF_LIGHT
+        # at the picture's corner a range is so much longer than the depth
+        secant = np.hypot(1, np.hypot(self.rows_px, self.columns_px) / 2 / self.focal_length_px)
+        span = 2 * (self.far_m - self.near_m) * secant / SPEED_OF_LIGHT
         needed = int(np.ceil((span + 2 * self._margin) / (self.bin_width_ps * PICOSECOND)))
         require(
             self.bins >= needed,
@@ -125,12 +127,6 @@ class Design:
         """Write a TOML file, whole or not at all."""
         with atomic_path(Path(path)) as temporary:
             temporary.write_text(tomli_w.dumps(asdict(self)), encoding="utf-8")
-
-    @property
-    def _secant(self) -> float:
-        """By how much a range at the picture's corner is longer than the depth."""
-        half = np.hypot(self.rows_px, self.columns_px) / 2 / self.focal_length_px
-        return float(np.hypot(1, half))
 
     @property
     def _margin(self) -> float:

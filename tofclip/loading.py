@@ -15,6 +15,7 @@ from tofclip.io.archive import Archive
 from tofclip.io.light_fields import read_exr_parts, read_light_field
 from tofclip.io.streaks import outline_streak_file
 from tofclip.lidar import PointCloud
+from tofclip.lidar.export import FORMATS
 from tofclip.storage import (
     HDF5_SIGNATURE,
     Field,
@@ -37,7 +38,7 @@ HOMES = {
     "streak": ("tofclip.shots", "Streak"),
     "volume": ("nlos", "Volume"),
 }
-CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57")
+CLOUD_SUFFIXES = tuple(FORMATS)
 EXR_SIGNATURE, NPZ_SIGNATURE = b"\x76\x2f\x31\x01", b"PK\x03\x04"
 
 

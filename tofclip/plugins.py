@@ -73,7 +73,8 @@ class Parts(Mapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         """Import the part of that name; `InputError` where there is none, or it does not load."""
         if name in self.own:
-            return load_target(self.own[name])
+            module, _, part = self.own[name].partition(":")
+            return getattr(import_module(module), part)
         if name in self.registered:
             return self.registered[name]
         require_known(self.kind, name, self)
@@ -206,12 +207,6 @@ def read_by_signature(
                 refusals.append(fault)
     known = f"is not a {what} of a known format ({', '.join(readers)}){broken}"
     raise refusals[0] if refusals else FileFormatError(path, known)
-
-
-def load_target(target: str) -> Any:
-    """Import what ``"module:name"`` names."""
-    module, _, name = target.partition(":")
-    return getattr(import_module(module), name)
 
 
 def list_settings(part: Any) -> dict[str, inspect.Parameter]:

@@ -52,14 +52,10 @@ class StillSum:
         full = self.shots[1] >= self.shots[0]
         grown = full & (self.shots[0] < self._block_shots)
         for held in (self.blocks, self._windows, self.shots):
-            if moved.any():
-                held[:, moved] = 0
-            if grown.any():
-                held[0, grown] += held[1, grown]
-            if (replaced := full & ~grown).any():
-                held[0, replaced] = held[1, replaced]
-            if full.any():
-                held[1, full] = 0
+            held[:, moved] = 0
+            held[0, grown] += held[1, grown]
+            held[0, full & ~grown] = held[1, full & ~grown]
+            held[1, full] = 0
         self.blocks[1] += histograms
         self._windows[1] += seen
         self.shots[1] += 1

@@ -36,8 +36,7 @@ from tofclip.recovery import (
     plan_recovery,
 )
 from tofclip.recovery.defects import estimate_noise
-from tofclip.recovery.focus import DEFAULT_FOCUS
-from tofclip.recovery.shot import count_needless_rows
+from tofclip.recovery.shot import DEFAULT_FOCUS, count_needless_rows
 from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces
 from tofclip.recovery.surfaces.returns import list_returns
 from tofclip.sequences.counting import StillSum

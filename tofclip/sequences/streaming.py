@@ -30,7 +30,7 @@ from tofclip.lidar.photons import PhotonCube
 from tofclip.plugins import METHODS
 from tofclip.recovery import Focus, SharpestFocus, SurfaceRecovery
 from tofclip.recovery.defects import measure_levels, take_levels
-from tofclip.recovery.focus import DEFAULT_FOCUS
+from tofclip.recovery.shot import DEFAULT_FOCUS
 from tofclip.sequences.counting import PhotonPipeline
 from tofclip.sequences.ranger import (
     ChangedPipeline,
