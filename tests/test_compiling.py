@@ -5,6 +5,7 @@ keep it.
 import io
 import logging
 import os
+import pickle
 import subprocess
 import sys
 
@@ -129,13 +130,19 @@ sys.exit(cli.main([]))
         full = "file._save_data = lambda *_: open('/dev/full', 'w', 1).write('loop\\n')"
         self.assert_not_kept(self.run(tmp_path, tmp_path / "home", tmp_path / "cache", fill, full))
 
-    def test_a_damaged_cache_is_passed_over(self, tmp_path):
+    @pytest.mark.parametrize(
+        "left",
+        [b"", pickle.dumps(numba.__version__) + b"ctofclip.gone\nloop\n."],
+        ids=["damaged", "of a version with other modules"],
+    )
+    def test_a_cache_that_cannot_be_read_is_made_anew(self, tmp_path, left):
         assert self.run(tmp_path, tmp_path / "home", tmp_path) == []
         kept = list(tmp_path.rglob("*.nb[ic]"))
         assert kept
         for file in kept:
-            file.write_bytes(b"")
-        self.assert_not_kept(self.run(tmp_path, tmp_path / "home", tmp_path))
+            file.write_bytes(left)
+        assert self.run(tmp_path, tmp_path / "home", tmp_path) == []
+        assert all(file.read_bytes() != left for file in kept)
 
 
 # Vectors in compiled loops do what NumPy does with sixteen numbers: whole ones, of which float32

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, partial
 from pickle import UnpicklingError
 from typing import Any, TypeVar
@@ -29,8 +30,9 @@ SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 SUMS_AS_WRITTEN = {"contract", "nsz", "arcp", "afn"}
 # For numbers without a sign: beside one with a sign the compiler would make both floats.
 ONE = np.uintp(1)
-# What a full, forbidden or damaged cache raises.
-UNUSABLE = (OSError, EOFError, UnpicklingError)
+# What a damaged cache raises, or one of a version whose loops lay in other modules; a full or forbidden one.
+UNREADABLE = (EOFError, UnpicklingError, ImportError, AttributeError)
+UNUSABLE = (OSError, *UNREADABLE)
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -41,8 +43,12 @@ class _DiskCache(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)
-        except UNUSABLE:
-            return None
+        except UNREADABLE:  # which nothing could be added to either
+            with suppress(OSError):
+                self.flush()
+        except OSError:
+            pass
+        return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
