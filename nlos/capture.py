@@ -31,7 +31,7 @@ from tofclip.arrays import (
 from tofclip.errors import InputError, ShapeError, require_positive, require_type
 from tofclip.notebook import render_html
 from tofclip.shots import RELAY_WALL, Frames
-from tofclip.storage import Field, Record
+from tofclip.storage import Storable, stored_array, stored_mapping, stored_value
 from tofclip.units import PICOSECOND, SPEED_OF_LIGHT, require_credible_bin_width
 
 MIN_BINS = 2
@@ -86,8 +86,17 @@ MAX_WALL_EXTENT_M = 1e3
 MAX_SPACING_POINTS = 1000
 
 
+def _name_places(axes: int) -> tuple[str, ...]:
+    """Names of the axes of wall points, which may have any number."""
+    return ("row", "column") if axes == 2 else tuple(f"wall_{i}" for i in range(axes))
+
+
+def _name_coordinates(axes: int) -> tuple[str, ...]:
+    return (*_name_places(axes - 1), "xyz")
+
+
 @dataclass(frozen=True, eq=False)
-class Capture:
+class Capture(Storable):
     """What a detector saw at points of a relay wall while the laser lit one spot, or a spot for
     each point.
 
@@ -120,12 +129,18 @@ class Capture:
         behind the wall.
     """
 
-    signal: Array
-    wall: FloatArray
-    laser: FloatArray
-    bin_width: float
-    start: float = 0.0
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    RECORD_KIND = "capture"
+
+    signal: Array = field(
+        metadata=stored_array(
+            "count", dtype=np.float32, layout=lambda axes: ("time", *_name_places(axes - 1))
+        )
+    )
+    wall: FloatArray = field(metadata=stored_array("m", layout=_name_coordinates))
+    laser: FloatArray = field(metadata=stored_array("m", layout=_name_coordinates))
+    bin_width: float = field(metadata=stored_value("bin_width_s"))
+    start: float = field(default=0.0, metadata=stored_value("start_m"))
+    provenance: Mapping[str, Any] = stored_mapping("provenance")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "signal", _to_float_signal(self.signal))
@@ -329,42 +344,11 @@ class Capture:
         signal = _shift_earlier(to_numpy(seen), legs / (SPEED_OF_LIGHT * bin_width))
         return cls(signal, wall, laser, bin_width, start, frames.provenance)
 
-    def to_record(self) -> Record:
-        """Return everything that has to be stored."""
-        names = tuple(f"wall_{i}" for i in range(self.wall.ndim - 1))
-        if self.wall.ndim == 3:
-            names = ("row", "column")
-        fields = {
-            "signal": Field(to_numpy(self.signal), "count", ("time", *names)),
-            "wall": Field(self.wall, "m", (*names, "xyz")),
-            "laser": Field(self.laser, "m", ("xyz",) if self.laser.ndim == 1 else (*names, "xyz")),
-        }
-        attributes = {"bin_width_s": self.bin_width, "start_m": self.start}
-        return Record("capture", fields, attributes, provenance=self.provenance)
-
-    @classmethod
-    def from_record(cls, record: Record) -> Capture:
-        """Rebuild a capture from its ``record``."""
-        dimensions = {name: entry.values.ndim for name, entry in record.fields.items()}
-        return cls(
-            signal=record.array("signal", np.float32, dimensions.get("signal", 0), "count"),
-            wall=record.array("wall", np.float64, dimensions.get("wall", 0), "m"),
-            laser=record.array("laser", np.float64, dimensions.get("laser", 0), "m"),
-            bin_width=record.number("bin_width_s"),
-            start=record.number("start_m"),
-            provenance=record.provenance,
-        )
-
     def save(self, path: str | Path, compressed: bool = True) -> None:
         """Write the capture to an HDF5 file ``path``, whole or not at all; one that is not
         ``compressed`` is read several times faster.
         """
         self.to_record().save(path, compressed)
-
-    @classmethod
-    def load(cls, path: str | Path) -> Capture:
-        """Read the capture that `save` wrote to ``path``."""
-        return cls.from_record(Record.load(path, "capture"))
 
 
 def measure_extent(capture: Capture) -> float:

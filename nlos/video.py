@@ -31,10 +31,10 @@ from nlos.phasor.arrays import ArrayLibrary
 from nlos.phasor.plan import Hybrid, PlanarRSD, plan_groups, require_even_grid
 from nlos.phasor.propagate import Backend
 from nlos.phasor.to_depths import DepthPropagator
-from nlos.volume import AXES, Grid, Volume, load_axes, store_axes
+from nlos.volume import AXES, Grid, Volume
 from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray
 from tofclip.errors import InputError, ShapeError
-from tofclip.storage import Field, Record
+from tofclip.storage import Storable, stored_array, stored_mapping, stored_part
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -93,7 +93,7 @@ FieldCallback = Callable[[int, slice, ComplexArray], None]
 
 
 @dataclass(frozen=True, eq=False)
-class TransientVideo:
+class TransientVideo(Storable):
     """Brightness of a hidden scene at several instants.
 
     Parameters
@@ -112,10 +112,16 @@ class TransientVideo:
         Values, times and grid disagree.
     """
 
-    values: Float32Array
-    times: FloatArray
-    grid: Grid
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    RECORD_KIND = "transient video"
+
+    values: Float32Array = field(
+        metadata=stored_array(
+            dtype=np.float32, layout=lambda axes: ("time", *AXES[len(AXES) + 1 - axes :])
+        )
+    )
+    times: FloatArray = field(metadata=stored_array("s", "time", name="time"))
+    grid: Grid = field(metadata=stored_part(Grid))
+    provenance: Mapping[str, Any] = stored_mapping("provenance")
 
     def __post_init__(self) -> None:
         scene = self.grid.shape
@@ -123,38 +129,11 @@ class TransientVideo:
             wanted = f"(t, [z,] y, x) of {self.times.size} x {scene}"
             raise ShapeError("a transient video", wanted, self.values.shape)
 
-    def to_record(self) -> Record:
-        """Return everything that has to be stored."""
-        values = Field(self.values, "", ("time", *AXES[-self.values.ndim + 1 :]))
-        fields = {
-            "values": values,
-            "time": Field(self.times, "s", ("time",)),
-            **store_axes(self.grid),
-        }
-        return Record("transient video", fields, provenance=self.provenance)
-
-    @classmethod
-    def from_record(cls, record: Record) -> TransientVideo:
-        """Rebuild a video from its ``record``."""
-        dimensions = record.fields["values"].values.ndim if "values" in record.fields else 4
-        values = record.array("values", np.float32, dimensions)
-        times = record.array("time", np.float64, 1, "s")
-        return cls(values, times, load_axes(record), record.provenance)
-
-    def save(self, path: str | Path) -> None:
-        """Write the video to an HDF5 file ``path``, whole or not at all."""
-        self.to_record().save(path)
-
     def save_film(self, path: str | Path) -> None:
         """Draw the front view at every instant into a GIF ``path``, with axes in metres."""
         from nlos.picture import save_film
 
         save_film(self, path)
-
-    @classmethod
-    def load(cls, path: str | Path) -> TransientVideo:
-        """Read the video that `save` wrote to ``path``."""
-        return cls.from_record(Record.load(path, "transient video"))
 
 
 @dataclass(frozen=True)

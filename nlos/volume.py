@@ -21,7 +21,7 @@ from tofclip.arrays import (
 )
 from tofclip.errors import InputError, ShapeError
 from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
-from tofclip.storage import Field, Record
+from tofclip.storage import Storable, stored_array, stored_mapping, stored_part
 
 if TYPE_CHECKING:
     from nlos.capture import Capture
@@ -50,9 +50,9 @@ class Grid:
         An axis is empty or not one-dimensional, holds NaN or infinity, or does not increase.
     """
 
-    x: FloatArray
-    y: FloatArray
-    z: FloatArray
+    x: FloatArray = field(metadata=stored_array("m", "x"))
+    y: FloatArray = field(metadata=stored_array("m", "y"))
+    z: FloatArray = field(metadata=stored_array("m", "z"))
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "z"):
@@ -191,16 +191,6 @@ def _fill_axis(name: str, side: Sequence[float], voxel: float) -> FloatArray:
 AXES = ("z", "y", "x")
 
 
-def store_axes(grid: Grid) -> dict[str, Field]:
-    """Return the fields of a record that hold a grid."""
-    return {name: Field(getattr(grid, name), "m", (name,)) for name in AXES}
-
-
-def load_axes(record: Record) -> Grid:
-    """Return the grid that a ``record`` holds."""
-    return Grid(*(record.array(name, np.float64, 1, "m") for name in "xyz"))
-
-
 @dataclass(frozen=True, eq=False)
 class Projection:
     """The brightest voxel along every line of sight in z.
@@ -217,7 +207,7 @@ class Projection:
 
 
 @dataclass(frozen=True, eq=False)
-class Volume:
+class Volume(Storable):
     """Brightness, or complex phasor field, on a grid of voxels.
 
     Pictures of it look along +z, from the relay wall into the hidden scene, x to the right and y
@@ -245,9 +235,11 @@ class Volume:
         Values and grid disagree, or a value is not a finite number.
     """
 
-    values: Array
-    grid: Grid
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    RECORD_KIND = "volume"
+
+    values: Array = field(metadata=stored_array("", *AXES, dtype=None))
+    grid: Grid = field(metadata=stored_part(Grid))
+    provenance: Mapping[str, Any] = stored_mapping("provenance")
 
     def __post_init__(self) -> None:
         values = np.ascontiguousarray(self.values) if is_numpy(self.values) else self.values
@@ -374,24 +366,6 @@ class Volume:
         """Return the values (z, y, x) as a PyTorch tensor, sharing memory; needs PyTorch."""
         return require_package("torch").as_tensor(to_numpy(self.values))
 
-    def to_record(self) -> Record:
-        """Return everything that has to be stored."""
-        fields = {"values": Field(to_numpy(self.values), "", AXES), **store_axes(self.grid)}
-        return Record("volume", fields, provenance=self.provenance)
-
-    @classmethod
-    def from_record(cls, record: Record) -> Volume:
-        """Rebuild a volume from its ``record``."""
-        field = record.fields.get("values")
-        kept = field is not None and field.values.dtype.kind in "fc"
-        values = record.array("values", field.values.dtype if field and kept else np.float32, 3)
-        return cls(values, load_axes(record), record.provenance)
-
     def save(self, path: str | Path, compressed: bool = True) -> None:
         """Write the volume to an HDF5 file ``path``, ``compressed`` or not, whole or not at all."""
         self.to_record().save(path, compressed)
-
-    @classmethod
-    def load(cls, path: str | Path) -> Volume:
-        """Read the volume that `save` wrote to ``path``."""
-        return cls.from_record(Record.load(path, "volume"))

@@ -348,19 +348,24 @@ class Storable:
 def stored_array(
     units: str = "",
     *axes: str,
-    dtype: DTypeLike = np.float64,
+    dtype: DTypeLike | None = np.float64,
     name: str = "",
     dimensions: int | None = None,
+    layout: Callable[[int], tuple[str, ...]] | None = None,
     optional: bool = False,
     skip_empty: bool = False,
 ) -> Metadata:
-    """Declare an array with its unit and the names of its axes (`dimensions` where they have none).
+    """Declare an array with its unit and the names of its axes (`dimensions` where they have none;
+    `layout` of an array of any dimensions, from how many to their names). Without a `dtype` real and
+    complex floating-point numbers stay as they are.
     `name` in the file is by default the dataclass field's; boolean arrays are stored as 0 and 1.
     Where it is `optional`, None is a value, and files without it get the field's default;
     `skip_empty` leaves an array without elements out of the file.
     """
     ndim = len(axes) if dimensions is None else dimensions
-    options = {"units": units, "axes": axes, "dtype": np.dtype(dtype), "name": name, "ndim": ndim}
+    kind = None if dtype is None else np.dtype(dtype)
+    options = {"units": units, "layout": layout or (lambda _: axes), "dtype": kind, "name": name}
+    options["ndim"] = None if layout else ndim
     return _declare("array", **options, optional=optional, skip_empty=skip_empty)
 
 
@@ -423,7 +428,8 @@ def _write_fields(item: Any, record: Any) -> None:
                 if how.dtype == bool:
                     values = values.astype(np.uint8)
                 if values.size or not how.skip_empty:
-                    record.fields[how.name or name] = Field(values, how.units, how.axes)
+                    axes = how.layout(values.ndim)
+                    record.fields[how.name or name] = Field(values, how.units, axes)
             case "value":
                 names = how.names or (name,)
                 several = value if len(names) > 1 else (value,)
@@ -450,9 +456,13 @@ def _read_fields(kind: type, record: Record) -> Any:
             case "array":
                 stored = how.name or name
                 if stored in record.fields or not how.optional:
-                    dtype = np.uint8 if how.dtype == bool else how.dtype
-                    array = record.array(stored, dtype, how.ndim, how.units)
-                    values[name] = array.astype(how.dtype, copy=False)
+                    held = record.fields.get(stored, Field(np.zeros(0))).values
+                    kept = held.dtype if held.dtype.kind in "fc" else np.dtype(np.float32)
+                    wanted = how.dtype or kept
+                    dtype = np.uint8 if wanted.kind == "b" else wanted
+                    ndim = held.ndim if how.ndim is None else how.ndim
+                    array = record.array(stored, dtype, ndim, how.units)
+                    values[name] = array.astype(wanted, copy=False)
             case "value":
                 names = how.names or (name,)
                 if names[0] in record.attributes or not how.optional:
