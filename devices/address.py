@@ -10,7 +10,7 @@ from math import inf, isfinite
 from typing import Any, Self, TypeVar
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require
 
 T = TypeVar("T")
 
@@ -28,8 +28,7 @@ class Uri:
 
     @classmethod
     def parse(cls, text: str) -> Uri:
-        if not text.isprintable():
-            raise InputError(f"{text!r} holds control characters, which no address has")
+        require(text.isprintable(), f"{text!r} holds control characters, which no address has")
         scheme, separator, rest = text.partition("://")
         if not separator or not scheme:
             raise InputError(
@@ -40,8 +39,7 @@ class Uri:
             pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
         except ValueError as fault:
             raise InputError(f"'{text}': after the ? come name=value pairs joined by &") from fault
-        if len({name for name, _ in pairs}) != len(pairs):
-            raise InputError(f"'{text}': a name is given twice")
+        require(len({name for name, _ in pairs}) == len(pairs), f"'{text}': a name is given twice")
         return cls(text, scheme.lower(), unquote(place), dict(pairs))
 
     def reject_unknown(self, *names: str) -> None:

@@ -23,7 +23,7 @@ from devices.address import Uri
 from devices.frames import make_streak_calibration
 from devices.source import READ_TIMEOUT_S, Batch, Info, Ledger, Records, Source, Stats
 from tofclip.arrays import IntArray
-from tofclip.errors import FileFormatError, InputError
+from tofclip.errors import FileFormatError, InputError, require
 from tofclip.files import (
     BoundedFile,
     format_error_line,
@@ -244,8 +244,7 @@ def open_ptu(uri: Uri) -> RecordFile:
 def open_ttbin(uri: Uri) -> RecordFile:
     """Open ``file://run.ttbin?sync=1``; ``sync`` is the channel of the laser's pulses."""
     uri.reject_unknown("sync")
-    if "sync" not in uri.values:
-        raise InputError(f"'{uri.text}': name the channel of the laser's pulses: sync=1")
+    require("sync" in uri.values, f"'{uri.text}': name the channel of the laser's pulses: sync=1")
     sync = uri.value("sync", int, 0)
     return RecordFile(uri.location, lambda path: SwabianPhotons(path, sync))
 

@@ -17,7 +17,7 @@ from devices.source import ByteView, Codec, DecodeResult, Gap, Ledger, Records
 from devices.stream import Feed, InstrumentClock, LiveOptions, Transfer, retry_connect
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require
 from tofclip.storage import Field, Record, Scalar
 
 
@@ -158,8 +158,7 @@ class FrameCodec(Codec):
         numbers, counts = np.ascontiguousarray(records["number"]), records["counts"]
         if np.any(np.diff(numbers, prepend=-1) <= 0):
             raise InputError("frames must have rising numbers from 0")
-        if self.bits == 1 and counts.max(initial=0) > 1:
-            raise InputError("a single bit is 0 or 1")
+        require(not (self.bits == 1 and counts.max(initial=0) > 1), "a single bit is 0 or 1")
         as_sent = np.rot90(counts, -self.quarter_turns, axes=(1, 2))
         flat = np.ascontiguousarray(as_sent).reshape(len(records), self.rows * self.columns)
         pixels = np.packbits(flat, axis=1) if self.bits == 1 else flat.view(np.uint8)

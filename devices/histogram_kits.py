@@ -37,8 +37,8 @@ from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceNotFoundError,
     DeviceTimeoutError,
-    InputError,
     MissingDependencyError,
+    require,
 )
 from tofclip.storage import Field, Record
 from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
@@ -198,10 +198,8 @@ class Tmf8828Options(LiveOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 < self.bin_ps < 1e6:
-            raise InputError("add bin_ps=..., the duration of a bin as the kit was set")
-        if self.zones not in TMF_ZONES:
-            raise InputError(f"a TMF8828 has 64 zones or 9, not {self.zones}")
+        require(0 < self.bin_ps < 1e6, "add bin_ps=..., the duration of a bin as the kit was set")
+        require(self.zones in TMF_ZONES, f"a TMF8828 has 64 zones or 9, not {self.zones}")
 
     @property
     def bin_width(self) -> float:
@@ -366,8 +364,7 @@ def open_vl53l8(uri: Uri) -> StreamSource:
 
 
 def _open_kit(uri: Uri, options: Tmf8828Options | Vl53l8Options) -> StreamSource:
-    if not uri.location:
-        raise InputError(
-            f"'{uri.text}': name the serial port, as in {uri.scheme}:///dev/ttyACM0?..."
-        )
+    require(
+        uri.location, f"'{uri.text}': name the serial port, as in {uri.scheme}:///dev/ttyACM0?..."
+    )
     return StreamSource(KitFeed(uri.location, options), options)

@@ -48,7 +48,7 @@ from devices.source import (
     as_bytes,
 )
 from tofclip.arrays import FloatArray, IntArray
-from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
+from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError, require
 from tofclip.files import guard, read_toml, suggest_name, translate_read_errors
 from tofclip.storage import Record, Storable, stored_array
 from tofclip.threads import run_blocks
@@ -235,8 +235,7 @@ class BoardCalibration(Storable):
             object.__setattr__(self, name, table)
             if table.shape != shape:
                 raise ShapeError(f"LinoSPAD2's {name}", shape, table.shape)
-            if not np.all(np.isfinite(table)):
-                raise InputError(f"LinoSPAD2's {name} must be finite")
+            require(np.all(np.isfinite(table)), f"LinoSPAD2's {name} must be finite")
         ends = self.code_ends
         if (
             np.any(np.diff(ends, axis=1) < 0)
@@ -446,6 +445,5 @@ class LinoSpad2File(SeekableSource):
 def open_recording(uri: Uri) -> LinoSpad2File:
     """Open ``linospad2://run.dat`` or ``file://run.dat``."""
     uri.reject_unknown()
-    if not uri.location:
-        raise InputError(f"'{uri.text}': name a recording; {LIMITATION}")
+    require(uri.location, f"'{uri.text}': name a recording; {LIMITATION}")
     return LinoSpad2File(uri.location)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tofclip.arrays import AnyArray
-from tofclip.errors import BufferOverflowError, DeviceTimeoutError, InputError
+from tofclip.errors import BufferOverflowError, DeviceTimeoutError, InputError, require
 from tofclip.storage import Record, Scalar
 
 Records = AnyArray  # One-dimensional NumPy structured array, one row per record
@@ -545,8 +545,7 @@ class SeekableSource(DecodedSource):
         return Batch(batch.records[skipped:], batch.first + skipped) if skipped else batch
 
     def seek(self, record: int) -> None:
-        if record < 0:
-            raise InputError(f"records are numbered from 0, got {record}")
+        require(record >= 0, f"records are numbered from 0, got {record}")
         marks, tap = self._checkpoints, self.tap
         self.tap = None  # what is stepped over is not read
         try:
@@ -556,8 +555,7 @@ class SeekableSource(DecodedSource):
         finally:
             self.tap = tap
         reached = marks[self._next].delivered
-        if record > reached:
-            raise InputError(f"{self._name} has only {reached} records, no record {record}")
+        require(record <= reached, f"{self._name} has only {reached} records, no record {record}")
         if record < reached:
             self._go_to(self._next - 1)
             self._skip = record - marks[self._next].delivered

@@ -24,7 +24,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from devices.source import ByteView, Codec, DecodeResult, Records
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require
 
 RECORD_BYTES = 6
 TIME_BITS = 36
@@ -111,11 +111,9 @@ def _require_valid(records: Records) -> None:
     ticks, channels, flags = (records[name] for name in RECORD_DTYPE.names or ())
     if np.any(channels > CHANNEL_MASK) or np.any(flags > FLAG_MASK):
         raise InputError("a time tag has 4 channels and 3 flags")
-    if np.any((channels == 0) & (flags & (DELTA | WRAP) == 0)):
-        raise InputError("a strobe needs a channel")
+    require(not np.any((channels == 0) & (flags & (DELTA | WRAP) == 0)), "a strobe needs a channel")
     steps = np.diff(ticks, prepend=0)
-    if np.any(ticks < 0) or np.any(steps < 0):
-        raise InputError("time tags must not go back")
+    require(not (np.any(ticks < 0) or np.any(steps < 0)), "time tags must not go back")
     marked = flags & WRAP != 0
     # A decoder counts wraps by their records; after a loss it may infer one from a counter that
     # went back.

@@ -15,7 +15,7 @@ from nlos.band import VirtualPulse
 from nlos.capture import Capture, measure_extent, select_lasers
 from nlos.illumination import is_confocal
 from tofclip.arrays import BoolArray, FloatArray, to_numpy
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require
 
 # Steps of the mean signal's profile per width of the wall.
 PROFILE_STEPS_PER_WALL = 50
@@ -218,8 +218,7 @@ def require_plausible(capture: Capture) -> None:
     largest = float(abs(capture.signal).max())
     if not largest < MAX_SIGNAL:
         raise InputError(f"signals of {largest:.3g} overflow in single precision; scale them down")
-    if largest == 0:
-        raise InputError("every signal is 0: there is nothing to image")
+    require(largest != 0, "every signal is 0: there is nothing to image")
     brightest = float(capture.signal.max())
     if brightest == float(capture.signal.min()):
         raise InputError(f"every signal is {largest:.4g}, constant or saturated: nothing to image")

@@ -28,7 +28,7 @@ from tofclip.arrays import (
     require_numpy,
     to_numpy,
 )
-from tofclip.errors import InputError, ShapeError, require_positive, require_type
+from tofclip.errors import InputError, ShapeError, require, require_positive, require_type
 from tofclip.notebook import render_html
 from tofclip.shots import RELAY_WALL, Frames
 from tofclip.storage import Storable, stored_array, stored_mapping, stored_value
@@ -159,8 +159,7 @@ class Capture(Storable):
             raise InputError(f"the laser spot must be finite, got {self.laser}")
         TimeAxis(self.signal.shape[0], self.bin_width, self.start)
         require_credible_bin_width(self.bin_width)
-        if not np.any(self.valid):
-            raise InputError("every wall point is NaN: nothing is left to image with")
+        require(np.any(self.valid), "every wall point is NaN: nothing is left to image with")
         extent = measure_extent(self)
         if extent > MAX_WALL_EXTENT_M:
             raise InputError(f"a wall of {extent:g} m is not credible; give its points in metres")
@@ -385,8 +384,7 @@ def _count_non_finite(signal: Array, valid: BoolArray) -> int:
 
 def _to_real_array(values: Any, dtype: type, name: str) -> AnyArray:
     array = np.asarray(values)
-    if array.dtype.kind not in "fiub":
-        raise InputError(f"{name} must hold real numbers, got {array.dtype}")
+    require(array.dtype.kind in "fiub", f"{name} must hold real numbers, got {array.dtype}")
     return np.ascontiguousarray(array, dtype=dtype)
 
 

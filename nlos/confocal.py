@@ -26,7 +26,7 @@ from nlos.method import (
 from nlos.plane import PlanarWall, Plane, axis_step
 from nlos.volume import Grid, Volume
 from tofclip.arrays import AnyArray, ComplexArray, Float32Array, FloatArray
-from tofclip.errors import InputError, require_positive
+from tofclip.errors import InputError, require, require_positive
 from tofclip.threads import run_blocks, thread_count
 
 # Points may be off the lattice by this fraction of its step.
@@ -167,8 +167,7 @@ def _shift_to_distance_zero(capture: Capture, bins: int) -> Float32Array:
 
 
 def _require_falloff(falloff: float) -> None:
-    if not 0 <= falloff < np.inf:
-        raise InputError(f"falloff must be a power of 0 or more, got {falloff}")
+    require(0 <= falloff < np.inf, f"falloff must be a power of 0 or more, got {falloff}")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlos.settings import declare_setting
-from tofclip.errors import FileFormatError, InputError, require_positive
+from tofclip.errors import FileFormatError, InputError, require, require_positive
 from tofclip.units import SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
@@ -105,8 +105,7 @@ def _build_hidden_scene(settings: SceneSettings) -> tuple[HiddenScene | PointSce
     from nlos.simulate import HiddenScene, Lambert, Material, PointScene, Retroreflector, Surface
 
     given = [name for name in ("letters", "points", "mesh") if getattr(settings, name) is not None]
-    if len(given) > 1:
-        raise InputError(f"{' and '.join(given)} cannot be hidden together; choose one of them")
+    require(len(given) <= 1, f"{' and '.join(given)} cannot be hidden together; choose one of them")
     if settings.points is not None:
         points = PointScene(np.array(_parse_points(settings.points)))
         return points, HiddenTruth(points.positions, 0.0)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tofclip.arrays import AnyArray, ComplexArray, Float32Array, FloatArray, IndexArray
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError, ShapeError, require
 
 if TYPE_CHECKING:
     from nlos.phasor.transfer import SphericalWaves
@@ -55,8 +55,7 @@ class Plane:
                 )
             object.__setattr__(self, name, axis)
         object.__setattr__(self, "z", float(self.z))
-        if not np.isfinite(self.z):
-            raise InputError(f"a plane needs a finite z, got {self.z}")
+        require(np.isfinite(self.z), f"a plane needs a finite z, got {self.z}")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -373,8 +372,7 @@ def _fit_lattice_axis(
     # Points of one column differ by far less than columns, even where some columns between are
     # missing.
     apart = gaps[gaps > SAME_COORDINATE_FRACTION * gaps.max(initial=0)]
-    if apart.size == 0:
-        raise InputError(f"the wall's points need at least two different {name}")
+    require(apart.size != 0, f"the wall's points need at least two different {name}")
     steps = round(float((ordered[-1] - ordered[0]) / np.median(apart)))
     axis = np.linspace(ordered[0], ordered[-1], steps + 1)
     place = np.rint((coordinates - axis[0]) / (axis[1] - axis[0])).astype(np.intp)

@@ -24,7 +24,7 @@ from nlos.illumination import is_confocal
 from nlos.method import PhasorMethod, PhasorPlan, PlannedGeometry, Progress
 from nlos.volume import Grid, Volume
 from tofclip.arrays import AnyArray, Float32Array, FloatArray, IndexArray, is_numpy, namespace
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require
 from tofclip.threads import split_blocks
 
 
@@ -65,8 +65,7 @@ def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> C
     `ramp` m, as a raised cosine; a sharp edge would show as a plane at half the margin.
     """
     for name, value in (("margin after the first bounce", margin), ("ramp after it", ramp)):
-        if not 0 <= value < np.inf:
-            raise InputError(f"the {name} must be 0 m or more, got {value}")
+        require(0 <= value < np.inf, f"the {name} must be 0 m or more, got {value}")
     direct = norm(capture.wall - capture.laser, axis=-1)
     paths = capture.axis.paths.reshape(-1, *[1] * direct.ndim)
     late = paths - (direct + margin)
@@ -80,8 +79,7 @@ def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> C
 
 def flip_capture(capture: Capture, axis: str) -> Capture:
     """Mirror a capture's coordinates along an axis, and with them the picture."""
-    if axis not in ("x", "y"):
-        raise InputError(f"a capture is mirrored along x or y, not along '{axis}'")
+    require(axis in ("x", "y"), f"a capture is mirrored along x or y, not along '{axis}'")
     sign = np.ones(3)
     sign["xy".index(axis)] = -1.0
     return replace(capture, wall=capture.wall * sign, laser=capture.laser * sign)
@@ -91,8 +89,7 @@ def fade_record_end(capture: Capture, length: float) -> Capture:
     """Let signals fade out over a path of `length`, m, by a raised cosine: where light still comes
     at the record's end, that would show as a plane.
     """
-    if not 0 < length < np.inf:
-        raise InputError(f"the record's end must fade over more than 0 m, got {length}")
+    require(0 < length < np.inf, f"the record's end must fade over more than 0 m, got {length}")
     paths = capture.axis.paths
     weight = (1 - np.cos(np.pi * np.clip((paths[-1] - paths) / length, 0, 1))) / 2
     shape = (-1, *[1] * (capture.wall.ndim - 1))

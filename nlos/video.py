@@ -33,7 +33,7 @@ from nlos.phasor.propagate import Backend
 from nlos.phasor.to_depths import DepthPropagator
 from nlos.volume import AXES, Grid, Volume
 from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError, ShapeError, require
 from tofclip.storage import Storable, stored_array, stored_mapping, stored_part
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
@@ -54,8 +54,7 @@ class DepthAverage:
     """
 
     def __init__(self, grid: Grid, wall: float, captures: int) -> None:
-        if captures < 1:
-            raise InputError(f"an average is over 1 capture or more, got {captures}")
+        require(captures >= 1, f"an average is over 1 capture or more, got {captures}")
         depth = np.maximum(grid.z - wall, 0)
         farthest = max(float(depth[-1]), np.finfo(float).tiny)
         self._windows = np.maximum(np.rint(captures * depth / farthest), 1).astype(int)
@@ -304,6 +303,5 @@ def _validate_times(times: ArrayLike) -> FloatArray:
     instants = np.asarray(times, dtype=np.float64)
     if instants.ndim != 1 or instants.size == 0:
         raise ShapeError("the instants of a video", "(t,) with t >= 1", instants.shape)
-    if not np.all(np.isfinite(instants)):
-        raise InputError("the instants of a video must be finite")
+    require(np.all(np.isfinite(instants)), "the instants of a video must be finite")
     return instants

@@ -19,7 +19,7 @@ from tofclip.arrays import (
     namespace,
     to_numpy,
 )
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError, ShapeError, require
 from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
 from tofclip.storage import Storable, stored_array, stored_mapping, stored_part
 
@@ -248,8 +248,7 @@ class Volume(Storable):
             values = xp.astype(values, xp.float32)
         if tuple(values.shape) != self.grid.shape:
             raise ShapeError("volume", f"(z, y, x) = {self.grid.shape}", tuple(values.shape))
-        if not xp.all(xp.isfinite(values)):
-            raise InputError("a volume must not hold NaN or infinity")
+        require(xp.all(xp.isfinite(values)), "a volume must not hold NaN or infinity")
         object.__setattr__(self, "values", values)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> AnyArray:
@@ -300,8 +299,7 @@ class Volume(Storable):
 
     def threshold(self, fraction: float) -> Volume:
         """Set every voxel to 0 that is weaker than ``fraction`` (0..1) of the brightest."""
-        if not 0 <= fraction <= 1:
-            raise InputError(f"a threshold is a fraction between 0 and 1, got {fraction}")
+        require(0 <= fraction <= 1, f"a threshold is a fraction between 0 and 1, got {fraction}")
         xp, magnitude = namespace(self.values), abs(self.values)
         bright = magnitude >= fraction * xp.max(magnitude)
         return replace(self, values=xp.where(bright, self.values, xp.zeros_like(self.values)))

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from devices.stream import Feed, StreamOptions, StreamSource
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require
 from tofclip.storage import Record
 
 REPLY_FAULTS = ("reply_late", "reply_lost", "reply_stall")
@@ -61,8 +61,7 @@ class Fault:
 def index_faults(faults: Sequence[Fault], kinds: Collection[str]) -> dict[int, Fault]:
     """Return faults by the number of what they spoil; others than these `kinds` are refused."""
     for fault in faults:
-        if fault.kind not in kinds:
-            raise InputError(f"its faults are {', '.join(kinds)}, not {fault.kind}")
+        require(fault.kind in kinds, f"its faults are {', '.join(kinds)}, not {fault.kind}")
     return {fault.transfer: fault for fault in faults}
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from devices.recording.read import HEADER_BYTES, Block, BlockKind, Ending
 from devices.source import Codec, Gap, Info, Piece, Stats
-from tofclip.errors import InputError, StorageError
+from tofclip.errors import InputError, StorageError, require
 from tofclip.files import explain_os_error
 from tofclip.storage import Record
 
@@ -178,8 +178,7 @@ def _create_file(path: Path, overwrite: bool, stack: contextlib.ExitStack) -> tu
         old = _lock_existing(path)
         if old is not None:
             stack.callback(os.close, old)
-            if not overwrite:
-                raise InputError(f"{path}: {_EXISTS}")
+            require(overwrite, f"{path}: {_EXISTS}")
         temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
         # 0o666, less what the user's umask takes away.
         file = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)

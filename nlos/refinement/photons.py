@@ -27,7 +27,7 @@ from nlos.preparation import remove_first_bounce
 from nlos.refinement.kernels import VOXELS_PER_RUN, add_backprojected_light, add_expected_light
 from nlos.volume import Grid, Volume
 from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require
 from tofclip.threads import run_blocks, thread_count
 
 # Photons of a bin; more are not counted one by one.
@@ -144,8 +144,7 @@ class CountedPhotons:
                 "where background was taken off: leave --refine out, or give the counts themselves"
             )
         lit = counts[counts > 0]
-        if lit.size == 0:
-            raise InputError("every signal is 0: there is nothing to image")
+        require(lit.size != 0, "every signal is 0: there is nothing to image")
         steps = lit.astype(np.float64) / float(lit.min())
         off = np.abs(steps - np.round(steps))
         if steps.max() > MAX_COUNT or np.any(off > STEP_TOLERANCE + ROUNDING * steps):
@@ -522,8 +521,7 @@ class PhotonPlan(Plan):
             grid = Grid(*((a[::2] + b) / 2 for a, b in zip(axes, last, strict=True)))
             for axis in range(3):
                 start = np.add.reduceat(start, range(0, start.shape[axis], 2), axis=axis)
-        if not start.any():
-            raise InputError("the linear image is dark: there is nothing to refine")
+        require(start.any(), "the linear image is dark: there is nothing to refine")
         seen = start.ravel()
         # Updates multiply: a voxel that begins at 0 would stay dark for ever.
         albedo = np.maximum(seen, START_FRACTION * seen.max())

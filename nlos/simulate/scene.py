@@ -17,7 +17,7 @@ from nlos.capture import Capture, TimeAxis
 from nlos.simulate.kernels import add_facet_light
 from nlos.simulate.walls import compute_wall_normals
 from tofclip.arrays import FloatArray, require_numpy
-from tofclip.errors import FileFormatError, InputError, ShapeError, require_positive
+from tofclip.errors import FileFormatError, InputError, ShapeError, require, require_positive
 from tofclip.files import format_error_line, translate_read_errors
 from tofclip.threads import run_blocks
 from tofclip.units import SPEED_OF_LIGHT
@@ -146,8 +146,7 @@ class Material:
 
     def __post_init__(self) -> None:
         for albedo in (self.diffuse, self.retro):
-            if not 0 <= albedo <= 1:
-                raise InputError(f"an albedo is a share between 0 and 1, got {albedo}")
+            require(0 <= albedo <= 1, f"an albedo is a share between 0 and 1, got {albedo}")
         require_positive("the spread of a retroreflector", self.spread, "angle")
 
 
@@ -290,8 +289,7 @@ class Surface:
         """
         require_positive("the height of letters", height, "number of metres")
         x, y = _rasterize_letters(text, height, spacing)
-        if x.size == 0:
-            raise InputError(f"'{text}' has no ink at a spacing of {spacing} m")
+        require(x.size != 0, f"'{text}' has no ink at a spacing of {spacing} m")
         positions = np.stack([x, y, 0 * x], axis=-1) + np.asarray(centre, dtype=np.float64)
         normals = np.tile(TOWARDS_WALL, (x.size, 1))
         half = spacing / 2 * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])
@@ -386,8 +384,7 @@ class HiddenScene:
     surfaces: Sequence[Surface]
 
     def __post_init__(self) -> None:
-        if not self.surfaces:
-            raise InputError("a hidden scene needs a surface")
+        require(self.surfaces, "a hidden scene needs a surface")
 
     def simulate_capture(self, wall: Any, laser: Any, axis: TimeAxis, jitter: float) -> Capture:
         """Simulate a capture without noise; ``wall``, ``laser``, ``axis`` and ``jitter`` as of

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from tofclip.arrays import FloatArray
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require
 
 DepthFunction = Callable[[FloatArray, FloatArray, float], FloatArray]
 """Depth z of the wall, m, at x and y in half wall widths, from -1 to 1; the third argument is that
@@ -50,8 +50,7 @@ def build_relay_wall(name: str, points: int = 64, width: float = 2.0) -> FloatAr
     InputError
         There is no such wall, too few points, or no width.
     """
-    if name not in WALLS:
-        raise InputError(f"no wall is called '{name}'; choose one of {', '.join(WALLS)}")
+    require(name in WALLS, f"no wall is called '{name}'; choose one of {', '.join(WALLS)}")
     if points < MIN_POINTS or not 0 < width < np.inf:
         raise InputError(
             f"a wall needs at least 2 x 2 points and a positive width, got {points} and {width} m"
