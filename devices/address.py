@@ -7,12 +7,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
 from math import inf, isfinite
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from tofclip.errors import InputError, require
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -41,32 +39,6 @@ class Uri:
             raise InputError(f"'{text}': after the ? come name=value pairs joined by &") from fault
         require(len({name for name, _ in pairs}) == len(pairs), f"'{text}': a name is given twice")
         return cls(text, scheme.lower(), unquote(place), dict(pairs))
-
-    def reject_unknown(self, *names: str) -> None:
-        """Refuse values of other names than these and `others`."""
-        self.others.difference_update(names)
-        for name in self.values:
-            if name not in (*names, *self.others):
-                known = ", ".join(names) or "nothing"
-                raise InputError(f"'{self.text}': '{name}' is unknown; {self.scheme} takes {known}")
-
-    def value(self, name: str, kind: Callable[[str], T], default: T) -> T:
-        """Return value `name` turned into a `kind` (``int``, ``float``, ``str``), or `default`."""
-        if name not in self.values:
-            return default
-        try:
-            return kind(self.values[name])
-        except InputError:
-            raise
-        except ValueError as fault:
-            raise InputError(f"'{self.text}': {name} cannot be '{self.values[name]}'") from fault
-
-    def choice(self, name: str, *words: str) -> str:
-        """Return value `name`, one of `words`; the first is the default."""
-        found = self.values.get(name, words[0])
-        if found not in words:
-            raise InputError(f"'{self.text}': {name} must be {' or '.join(words)}, got '{found}'")
-        return found
 
     def host_and_port(self, default_port: int) -> tuple[str, int]:
         """Return the place as ``HOST[:PORT]``."""
@@ -130,22 +102,30 @@ class Options:
     @classmethod
     def from_uri(cls, uri: Uri) -> Self:
         """Read an address, which has no values but these and `Uri.others`."""
-        uri.reject_unknown(*cls.names())
-        found: dict[str, Any] = {}
-        for one in cls.declared():
-            kind, choices = one.metadata["kind"], one.metadata["choices"]
-            if one.name not in uri.values:
-                continue
-            if kind is bool:
-                found[one.name] = uri.choice(one.name, "0", "1") == "1"
-            elif choices:
-                found[one.name] = uri.choice(one.name, *choices)
-            else:
-                found[one.name] = uri.value(one.name, kind, one.default)
+        names = cls.names()
+        uri.others.difference_update(names)
+        for name in uri.values:
+            if name not in (*names, *uri.others):
+                known = ", ".join(names) or "nothing"
+                raise InputError(f"'{uri.text}': '{name}' is unknown; {uri.scheme} takes {known}")
+        given = [one for one in cls.declared() if one.name in uri.values]
         try:
-            return cls(**found)
+            return cls(**{one.name: _parse_value(one, uri.values[one.name]) for one in given})
         except InputError as fault:
             raise InputError(f"'{uri.text}': {fault}") from fault
+
+
+def _parse_value(declared: Field[Any], text: str) -> Any:
+    name, kind, choices = declared.name, declared.metadata["kind"], declared.metadata["choices"]
+    choices = ("0", "1") if kind is bool else choices
+    if choices and text not in choices:
+        raise InputError(f"{name} must be {' or '.join(choices)}, got '{text}'")
+    try:
+        return text == "1" if kind is bool else kind(text)
+    except InputError:
+        raise
+    except ValueError as fault:
+        raise InputError(f"{name} cannot be '{text}'") from fault
 
 
 def parse_integers(text: str) -> tuple[int, ...]:

@@ -330,11 +330,8 @@ def find_cameras() -> list[DiscoveredInstrument]:
 
 
 def open_aravis(uri: Uri) -> StreamSource:
-    """Open ``aravis://NAME?exposure_us=1000&gain=0&frame_rate=25&pixel_format=Mono16&buffers=64``.
-
-    NAME is a camera's identifier or address, or nothing for the first one. ``row_ps`` gives the
-    duration of a row of a streak picture; ``mode=gated`` and ``gate_steps`` and so on say how an
-    intensifier's gate moves from frame to frame.
+    """Open ``aravis://NAME``, a camera's identifier or address, or nothing for the first one;
+    `CameraOptions` has its values.
     """
     options = CameraOptions.from_uri(uri)
     return StreamSource(AravisFeed(load_aravis(), uri.location, options), options)

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from devices.address import Uri
+from devices.address import Options, Uri, option
 from devices.frames import make_streak_calibration
 from devices.source import READ_TIMEOUT_S, Batch, Info, Ledger, Records, Source, Stats
 from tofclip.arrays import IntArray
-from tofclip.errors import FileFormatError, InputError, require
+from tofclip.errors import FileFormatError, InputError
 from tofclip.files import (
     BoundedFile,
     format_error_line,
@@ -234,31 +234,25 @@ class SwabianPhotons:
         return (pulse[is_photon], delay[is_photon], channel[is_photon]), lost
 
 
+@dataclass(frozen=True)
+class PulseOptions(Options):
+    """Values of addresses of time tags."""
+
+    sync: int | None = option(None, int)  # channel of the laser's pulses
+
+
 def open_ptu(uri: Uri) -> RecordFile:
     """Open ``file://run.ptu``; ``sync=N``: input of the laser's pulses in T2 mode."""
-    uri.reject_unknown("sync")
-    sync = uri.value("sync", int, 0) if "sync" in uri.values else None
+    sync = PulseOptions.from_uri(uri).sync
     return RecordFile(uri.location, lambda path: PtuPhotons(path, sync))
 
 
 def open_ttbin(uri: Uri) -> RecordFile:
     """Open ``file://run.ttbin?sync=1``; ``sync`` is the channel of the laser's pulses."""
-    uri.reject_unknown("sync")
-    require("sync" in uri.values, f"'{uri.text}': name the channel of the laser's pulses: sync=1")
-    sync = uri.value("sync", int, 0)
+    sync = PulseOptions.from_uri(uri).sync
+    if sync is None:
+        raise InputError(f"'{uri.text}': name the channel of the laser's pulses: sync=1")
     return RecordFile(uri.location, lambda path: SwabianPhotons(path, sync))
-
-
-def open_phu(uri: Uri) -> RecordFile:
-    """Open ``file://run.phu``."""
-    uri.reject_unknown()
-    return RecordFile(uri.location, _read_picoquant_histograms)
-
-
-def open_sdt(uri: Uri) -> RecordFile:
-    """Open ``file://run.sdt``; an image's pixels are its channels, row by row."""
-    uri.reject_unknown()
-    return RecordFile(uri.location, _read_becker_hickl_histograms)
 
 
 def _make_photons(pulse: Any, delay: Any, channel: Any) -> Records:
@@ -324,12 +318,6 @@ def _stack_histograms(
     return WholeRecords(records, Info(instrument, "", known.attributes), known)
 
 
-def open_streak_file(uri: Uri) -> RecordFile:
-    """Open ``file://shot.img`` or ``file://shot.tif``."""
-    uri.reject_unknown()
-    return RecordFile(uri.location, _read_picture)
-
-
 def _read_picture(path: Path) -> WholeRecords:
     """Return one frame, and the time axis that its file brings."""
     streak = read_streak(path)
@@ -346,3 +334,21 @@ def _read_picture(path: Path) -> WholeRecords:
     info = Info("streak image in a file", said.get("Camera/SerialNumber", ""), details)
     times = streak.row_times
     return WholeRecords(frame, info, None if times is None else make_streak_calibration(times))
+
+
+def _make_opener(files: str, read: Callable[[Path], WholeRecords]) -> Callable[[Uri], RecordFile]:
+    """Return what opens files of one piece, whose addresses have no values."""
+
+    def open_whole(uri: Uri) -> RecordFile:
+        Options.from_uri(uri)
+        return RecordFile(uri.location, read)
+
+    open_whole.__doc__ = f"Open {files}."
+    return open_whole
+
+
+open_phu = _make_opener("``file://run.phu``", _read_picoquant_histograms)
+open_sdt = _make_opener(
+    "``file://run.sdt``; an image's pixels are its channels", _read_becker_hickl_histograms
+)
+open_streak_file = _make_opener("``file://shot.img`` or ``file://shot.tif``", _read_picture)

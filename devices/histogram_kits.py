@@ -354,12 +354,12 @@ class KitFeed(FrameFeed):
 
 
 def open_tmf8828(uri: Uri) -> StreamSource:
-    """Open ``tmf8828:///dev/ttyACM0?bin_ps=PS&zones=64&baud=1000000&start=ezm``."""
+    """Open ``tmf8828:///dev/ttyACM0?bin_ps=PS``."""
     return _open_kit(uri, Tmf8828Options.from_uri(uri))
 
 
 def open_vl53l8(uri: Uri) -> StreamSource:
-    """Open ``vl53l8:///dev/ttyACM0?zones=16&bins=24&sub_sample=4&start_bin=0&baud=460800``."""
+    """Open ``vl53l8:///dev/ttyACM0``."""
     return _open_kit(uri, Vl53l8Options.from_uri(uri))
 
 

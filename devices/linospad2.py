@@ -28,7 +28,7 @@ from typing import Any, ClassVar, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.address import Uri
+from devices.address import Options, Uri
 from devices.linospad2_kernels import (
     ADDRESSES,
     CODE_MASK,
@@ -444,6 +444,6 @@ class LinoSpad2File(SeekableSource):
 
 def open_recording(uri: Uri) -> LinoSpad2File:
     """Open ``linospad2://run.dat`` or ``file://run.dat``."""
-    uri.reject_unknown()
+    Options.from_uri(uri)
     require(uri.location, f"'{uri.text}': name a recording; {LIMITATION}")
     return LinoSpad2File(uri.location)

@@ -631,12 +631,7 @@ class RemoteExFeed(FrameFeed):
 
 
 def open_remoteex(uri: Uri) -> StreamSource:
-    """Open
-    ``remoteex://HOST:1001?data_port=1002&buffers=16&mcp_gain=N&timeout_s=5&reconnect_s=5&buffer_mib=64``.
-    ``time_range=20 ns`` (or ``3`` for a synchroscan unit) sets the sweep before the start;
-    ``time_ranges_ps=165,500,1000`` says how long a synchroscan unit's ranges last, for one that
-    gives no scaling table.
-    """
+    """Open ``remoteex://HOST:1001``; `RemoteExOptions` has its values."""
     options = RemoteExOptions.from_uri(uri)
     host, port = uri.host_and_port(COMMAND_PORT)
     return StreamSource(RemoteExFeed(host, (port, options.data_port or port + 1), options), options)

@@ -293,11 +293,7 @@ class Spad512Feed(FrameFeed):
 
 
 def open_spad512(uri: Uri) -> StreamSource:
-    """Open
-    ``spad512://HOST:9999?bits=8&exposure_us=1000&images=1&width=512&pile_up=0&timeout_s=5&reconnect_s=5``.
-    ``mode=gated&gate_steps=72&gate_step_ps=252&gate_width_ns=5&gate_offset_ps=5000`` moves a gate
-    from picture to picture; ``images`` are whole scans then.
-    """
+    """Open ``spad512://HOST:9999``; `SpadOptions` has its values."""
     options = SpadOptions.from_uri(uri)
     host, port = uri.host_and_port(DEFAULT_PORT)
     return StreamSource(Spad512Feed(host, port, options), options)

@@ -433,9 +433,7 @@ class SendWindow:
 
 
 def open_timetag(uri: Uri) -> StreamSource:
-    """Open
-    ``timetag://SERIAL?channels=15&delta=0&transfer_kib=512&buffer_mib=64&policy=block&reconnect_s=5``.
-    """
+    """Open ``timetag://SERIAL``; `TimeTagOptions` has its values."""
     options, backend = TimeTagOptions.from_uri(uri), system_backend()
     try:
         return open_on_backend(options, uri.location, backend)

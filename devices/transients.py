@@ -394,18 +394,12 @@ def _open_source(
         yield source, replace(Accumulation.from_uri(left), bin_width=bin_width, line=line)
 
 
-def read_transients(address: str, bin_width: float | None = None) -> TransientStream:
-    """Read a source until it ends, and yield one shot after the other.
+class TransientStream(Iterator[LiveShot]):
+    """Shots of an address as they come, and where every other one went.
 
     One is made of each ``frames`` pictures of a camera, ``scans`` of a gate or ``records`` photons, as
     the address says; the last one may have fewer. The source is opened with the first shot, and
     closed with the stream. Memory: a batch of the source, and a shot.
-    """
-    return TransientStream(address, bin_width)
-
-
-class TransientStream(Iterator[LiveShot]):
-    """Shots as they come, and where every other one went; see `read_transients`.
 
     A live camera whose pictures are taken one by one is read newest first, unless the address
     chooses a ``policy``: what is shown or ranged late would be of no use. What is dropped for that

@@ -463,12 +463,12 @@ def _read_shots(
     source: str, bin_width: float | None
 ) -> Iterator[LiveShot] | Iterator[LiveShot | TofclipError]:
     """Shots of an instrument, a folder or a stack; errors in place of those that cannot be read."""
-    from devices.transients import find_address, read_transients
+    from devices.transients import TransientStream, find_address
     from tofclip.sequences import list_shots
 
     address = source if "://" in source else Path(source).is_file() and find_address(source)
     if address:
-        return read_transients(address, bin_width)
+        return TransientStream(address, bin_width)
 
     def read(shot: Callable[[], LiveShot]) -> LiveShot | TofclipError:
         try:

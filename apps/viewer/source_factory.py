@@ -20,7 +20,7 @@ from apps.viewer.sources import (
     VolumeSource,
     make_look_method,
 )
-from devices.transients import TrackedShots, read_transient, read_transients
+from devices.transients import TrackedShots, TransientStream, read_transient
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import read_streak
@@ -165,7 +165,7 @@ def _open_instrument(address: str, options: ShotOptions, announce: Announce) -> 
     """An instrument that goes on, or a recording, of which streak images are gathered once."""
     name = check_method(options.method)
     announce(f"waiting for the first shot of {address}")
-    shots = TrackedShots(read_transients(address, options.bin_width))
+    shots = TrackedShots(TransientStream(address, options.bin_width))
     first = shots.peek()
     if first is None:
         raise InputError(f"{address}: the source ended before it gave anything")

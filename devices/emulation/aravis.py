@@ -89,17 +89,14 @@ def _load_library() -> ctypes.CDLL:
 class EmulationOptions(CameraOptions):
     """Values of the emulation besides the driver's own."""
 
+    # stripes that move, or streak pictures in Mono16 of a scene, small with a slit of 256 pixels
     scene: str = option("", choices=("stripes", "small", "demo"))
-    seed: int = option(0, least=0)
-    lost_per_thousand: int = option(0, least=0, most=1000)
+    seed: int = option(0, least=0)  # of their photons
+    lost_per_thousand: int = option(0, least=0, most=1000)  # packets, on the wire
 
 
 def open_emulated(uri: Uri) -> StreamSource:
-    """Open ``sim+aravis://?frame_rate=100&scene=stripes&lost_per_thousand=0``: Aravis' own emulated
-    camera. ``scene``: ``stripes`` that move, or ``demo`` and ``small`` (a slit of 256 pixels), of
-    which it sends streak pictures in Mono16; ``seed``: of their photons; ``lost_per_thousand``:
-    packets lost on the wire.
-    """
+    """Open ``sim+aravis://``, Aravis' own emulated camera; `EmulationOptions` has its values."""
     options = EmulationOptions.from_uri(uri)
     library, serial = load_aravis(), uri.location or "EMULATED"
     light, known = None, None

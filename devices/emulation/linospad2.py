@@ -144,9 +144,7 @@ class SimulationOptions(StreamOptions):
 
 
 def open_simulated(uri: Uri) -> StreamSource:
-    """Open
-    ``sim+linospad2://?seed=1&cycles=250&photons=6000&firmware=2212b&timestamps=512&counter=0&pace=fast``.
-    """
+    """Open ``sim+linospad2://``; `SimulationOptions` has its values."""
     options = SimulationOptions.from_uri(uri)
     board = SimulatedBoard(
         simulate_line_light(),

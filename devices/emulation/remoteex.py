@@ -327,16 +327,14 @@ class EmulationOptions(StreakOptions):
     """Values of the emulation besides the driver's own."""
 
     seed: int = option(0, least=0)
-    scene: str = option("", choices=("demo", "small"))
+    scene: str = option("", choices=("demo", "small"))  # a small one has a slit of 256 pixels
     frame_rate: float = option(10.0)
     frames: int = option(FOREVER)  # then it is dark
     faults: tuple[Fault, ...] = option((), Fault.parse)
 
 
 def open_emulated(uri: Uri) -> StreamSource:
-    """Open ``sim+remoteex://?seed=1&scene=demo&frame_rate=10&frames=N&faults=...``, an emulated
-    camera behind TCP; ``scene=small`` has a slit of 256 pixels.
-    """
+    """Open ``sim+remoteex://``, an emulated camera behind TCP; `EmulationOptions` has its values."""
     options = EmulationOptions.from_uri(uri)
     seen = simulate_light(options.scene)
     light = EmulatedLight.of(seen, options.seed)

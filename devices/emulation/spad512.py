@@ -193,7 +193,7 @@ class EmulationOptions(SpadOptions):
 
 
 def open_emulated(uri: Uri) -> StreamSource:
-    """Open ``sim+spad512://?seed=1&rate=20000&pictures=N&faults=...``, before the demonstration."""
+    """Open ``sim+spad512://``, before the demonstration; `EmulationOptions` has its values."""
     options = EmulationOptions.from_uri(uri)
     server = EmulatedSpadArray(
         render_array_light() * options.rate,

@@ -31,7 +31,7 @@ from typing import Any
 
 import h5py
 
-from devices.address import Uri
+from devices.address import Options, Uri, option
 from devices.registry import build_codec
 from devices.source import READ_TIMEOUT_S, Batch, Closing, Codec, Gap, Info, Piece, SeekableSource
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
@@ -370,7 +370,14 @@ class ReplaySource(SeekableSource):
         self._last_due = due, block.time_ns
 
 
+@dataclass(frozen=True)
+class ReplayOptions(Options):
+    """Values of a recording's address."""
+
+    pace: str = option("", choices=("fast", "realtime"))
+
+
 def open_recording(uri: Uri) -> ReplaySource:
     """Open ``file://PATH?pace=fast``, or ``pace=realtime``."""
-    uri.reject_unknown("pace")
-    return ReplaySource(Path(uri.location), uri.choice("pace", "fast", "realtime") == "realtime")
+    is_paced = ReplayOptions.from_uri(uri).pace == "realtime"
+    return ReplaySource(Path(uri.location), is_paced)

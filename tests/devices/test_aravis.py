@@ -15,7 +15,7 @@ import devices
 from devices.aravis import UNNUMBERED, find_cameras, load_aravis
 from devices.emulation.aravis import EmulatedCamera
 from devices.emulation.scenes import EmulatedLight, simulate_line_light
-from devices.transients import read_photons, read_transient, read_transients
+from devices.transients import TransientStream, read_photons, read_transient
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceNotFoundError,
@@ -236,7 +236,7 @@ def test_a_streak_picture_has_its_rows_in_time(stand_in):
 
 def test_each_streak_picture_of_the_emulated_camera_becomes_a_cloud(aravis):
     """Over the network protocol: the clouds are those of the pictures that it drew."""
-    shots = read_transients("sim+aravis://?scene=small&frame_rate=10&seed=1&policy=block")
+    shots = TransientStream("sim+aravis://?scene=small&frame_rate=10&seed=1&policy=block")
     light = EmulatedLight.of(simulate_line_light(), 1)
     camera = simulate_line_light().camera
     first = next(shots)

@@ -1,13 +1,14 @@
 """Addresses, and the tables that say what they open."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 import devices
 from devices import registry
-from devices.address import Uri
+from devices.address import Options, Uri, option
 from devices.source import Info, Source, Stats
 from devices.transients import read_transient
 from tofclip.errors import InputError
@@ -29,8 +30,13 @@ class Nothing(Source):
         self.closed = True
 
 
+@dataclass(frozen=True)
+class NothingOptions(Options):
+    seed: int = option(0)
+
+
 def open_nothing(uri):
-    uri.reject_unknown("seed")
+    NothingOptions.from_uri(uri)
     return Nothing()
 
 
@@ -64,9 +70,6 @@ def test_a_scheme_opens_its_source(monkeypatch):
         devices.open("nothing://?speed=1")
 
 
-def test_values_of_an_address_are_read():
-    uri = Uri.parse("remoteex://lab-7:1001?seed=4")
-    assert uri.host_and_port(5) == ("lab-7", 1001)
+def test_a_place_is_a_computer_and_a_port():
+    assert Uri.parse("remoteex://lab-7:1001?seed=4").host_and_port(5) == ("lab-7", 1001)
     assert Uri.parse("tcp://[::1]").host_and_port(5) == ("::1", 5)
-    assert (uri.value("seed", int, 0), uri.value("absent", int, 7)) == (4, 7)
-    assert uri.choice("mode", "a", "b") == "a"

@@ -11,7 +11,7 @@ from devices import transients
 from devices.address import Options, option
 from devices.source import Batch, Info, Source, Stats
 from devices.timetag_codec import RECORD_DTYPE
-from devices.transients import read_transient, read_transients
+from devices.transients import TransientStream, read_transient
 from tofclip.errors import InputError, MissingTimeAxisError
 from tofclip.storage import Field, Record
 
@@ -96,7 +96,7 @@ def test_frames_are_added_up(canned):
 
 def test_shots_are_counted_on_where_an_instrument_begins_anew(canned):
     canned([Batch(frames(3, 4)), Batch(frames(1, 2), 2, after_gap=True)])
-    stream = read_transients("canned://")
+    stream = TransientStream("canned://")
     assert [stream.stamp.number for _ in stream] == [3, 4, 6, 7]
 
 
@@ -116,7 +116,7 @@ def test_a_source_s_own_values_are_not_taken_for_how_to_gather(
     monkeypatch.setattr(transients.registry.SOURCES, "registered", {"own": open_own})
     streak = read_transient("own://?frames=30&seconds=5")
     assert (own, streak.counts.max()) == ([30], 1)  # of the first frame alone
-    shots = read_transients("own://?frames=30")
+    shots = TransientStream("own://?frames=30")
     assert [shot.counts.max() for shot in shots] == [1, 2]
     with pytest.raises(InputError, match="'second' is unknown; own takes frames"):
         read_transient("own://?second=5")
@@ -148,7 +148,7 @@ def test_sources_that_give_no_transient(canned):
 
 
 def test_a_slow_viewer_gets_the_newest_picture_and_is_told_of_the_others():
-    stream = read_transients("sim+remoteex://?seed=2&scene=small&frame_rate=100")
+    stream = TransientStream("sim+remoteex://?seed=2&scene=small&frame_rate=100")
     next(stream)
     assert stream.is_live
     for _ in range(2):
