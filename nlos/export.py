@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.plane import axis_step, is_evenly_spaced
-from tofclip.arrays import Float32Array, to_numpy
-from tofclip.errors import InputError
+from tofclip.arrays import AnyArray, Float32Array, to_numpy
+from tofclip.errors import InputError, require
 from tofclip.files import atomic_path, require_suffix
 
 if TYPE_CHECKING:
@@ -75,15 +75,20 @@ def write_ply(
 def extract_surface(volume: Volume, fraction: float) -> Mesh:
     """Draw the surface of `Volume.surface` by marching cubes."""
     magnitude = volume.magnitude
-    if not 0 < fraction < 1:
-        raise InputError(
-            f"a surface lies at a fraction between 0 and 1 of the brightest, got {fraction}"
-        )
-    if min(magnitude.shape) < 2 or not magnitude.any():
-        raise InputError("a surface needs at least 2 voxels along every axis, and light")
+    require_surface(magnitude, fraction, 2)
     found = volume.to_pyvista().contour([fraction * float(magnitude.max())])
     faces = np.asarray(found.regular_faces, np.int32).reshape(-1, 3)
     return Mesh(np.asarray(found.points, np.float32), faces)
+
+
+def require_surface(magnitude: AnyArray, fraction: float, voxels: int) -> None:
+    """Refuse volumes that hold no surface or less than some `voxels` along an axis, and no fraction."""
+    require(
+        0 < fraction < 1,
+        f"a surface lies at a fraction between 0 and 1 of the brightest, got {fraction}",
+    )
+    lit = min(magnitude.shape) >= voxels and magnitude.any()
+    require(lit, f"a surface needs at least {voxels} voxels along every axis, and light")
 
 
 def extract_points(volume: Volume, fraction: float) -> tuple[Float32Array, Float32Array]:

@@ -1,88 +1,43 @@
 """Known hidden scenes: their settings, the capture that an instrument would make of them, the truth
 that travels in its file, and how well an image shows it.
-
-Importing this loads nothing heavy.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from nlos.settings import declare_setting
-from tofclip.errors import FileFormatError, InputError, require, require_positive
+import numpy as np
+from scipy.spatial import cKDTree
+
+from nlos.capture import Capture, TimeAxis
+from nlos.settings import MATERIALS, SCANS, SceneSettings
+from nlos.simulate import (
+    HiddenScene,
+    Lambert,
+    Material,
+    PointScene,
+    Retroreflector,
+    Surface,
+    add_poisson_noise,
+    build_relay_wall,
+)
+from nlos.volume import Grid, Volume
+from tofclip.arrays import BoolArray, FloatArray
+from tofclip.errors import InputError, require, require_positive
+from tofclip.storage import Record, Storable, is_own_file, stored_array, stored_value
 from tofclip.units import SPEED_OF_LIGHT
 
-if TYPE_CHECKING:
-    from nlos.capture import Capture, TimeAxis
-    from nlos.simulate import HiddenScene, PointScene
-    from nlos.volume import Grid, Volume
-    from tofclip.arrays import BoolArray, FloatArray
-    from tofclip.storage import Record
-
-SCANS = ("single", "confocal")
-WALLS = ("planar", "cylinder", "wavy", "relief", "plates")  # those of `nlos.simulate`
-MATERIALS = ("matte", "retroreflecting")
 # Room for the instrument's response behind the farthest path, in standard deviations.
 RESPONSE_SIGMAS = 6
-RECORD_KIND = "hidden_scene"
 # m; light so close to a hidden thing counts as its own, if voxels are not larger.
 TRUTH_RADIUS_M = 0.04
 
 
-@dataclass(frozen=True)
-class SceneSettings:
-    """What is hidden before which wall, how it is scanned, and the instrument with its noise. The
-    metadata of each field are those of `nlos.Settings`.
-    """
-
-    letters: str | None = declare_setting(
-        "", "Flat letters, as read from the wall.", shown="T, if nothing else is given"
-    )
-    points: str | None = declare_setting("", "Points that scatter evenly, in m.", shown="none")
-    mesh: str | None = declare_setting(
-        "", "Triangle mesh (.ply, .obj, .stl) in m, in the wall's frame.", shown="none"
-    )
-    depth: float = declare_setting("m", "Depth of the letters.", 1.0)
-    height: float = declare_setting("m", "Height of a capital letter.", 0.7)
-    material: str = declare_setting(
-        "", f"Of letters or mesh: {' or '.join(MATERIALS)}.", "matte", choices=MATERIALS
-    )
-    facet: float = declare_setting(
-        "m", "Size of the facets that letters or mesh are cut into.", 0.025, written="mm"
-    )
-    wall: str = declare_setting(
-        "",
-        "planar, cylinder, wavy, relief (hills) or plates (two, hanging apart).",
-        "cylinder",
-        choices=WALLS,
-    )
-    wall_points: int = declare_setting("1", "Rows of wall points, and columns.", 48)
-    wall_width: float = declare_setting("m", "Width and height of the wall.", 2.0)
-    scan: str = declare_setting("", "single (one laser spot) or confocal.", "single", choices=SCANS)
-    laser: tuple[float, float] = declare_setting(
-        "m", "Where the laser spot is, in m; the nearest wall point is taken.", (0.0, 0.0)
-    )
-    bin_width: float = declare_setting("s", "Duration of a time bin.", 32e-12, written="ps")
-    jitter: float = declare_setting(
-        "s", "Standard deviation of the instrument's response.", 30e-12, written="ps"
-    )
-    peak_counts: float | None = declare_setting(
-        "1", "Expected photons in the brightest bin.", shown="no noise"
-    )
-    background: float = declare_setting(
-        "1", "Expected background counts per bin, with --peak-counts.", 0.0
-    )
-    seed: int = declare_setting("1", "Of the photons' chance.", 0)
-
-
 def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:
     """Simulate the capture that settings describe, and say where things are hidden."""
-    from nlos.simulate import add_poisson_noise, build_relay_wall
-
     if settings.scan not in SCANS:
         raise InputError(f"no scan is called '{settings.scan}'; choose {' or '.join(SCANS)}")
     if settings.background and settings.peak_counts is None:
@@ -100,10 +55,6 @@ def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:
 
 def _build_hidden_scene(settings: SceneSettings) -> tuple[HiddenScene | PointScene, HiddenTruth]:
     """Build what is hidden, and say where it is."""
-    import numpy as np
-
-    from nlos.simulate import HiddenScene, Lambert, Material, PointScene, Retroreflector, Surface
-
     given = [name for name in ("letters", "points", "mesh") if getattr(settings, name) is not None]
     require(len(given) <= 1, f"{' and '.join(given)} cannot be hidden together; choose one of them")
     if settings.points is not None:
@@ -140,8 +91,6 @@ def _parse_points(text: str) -> list[list[float]]:
 
 def find_nearest_wall_point(wall: FloatArray, place: tuple[float, float]) -> FloatArray:
     """Return the point (3,) of a wall (..., 3), m, whose x and y are nearest to a place."""
-    import numpy as np
-
     known = wall[np.isfinite(wall).all(axis=-1)]
     return known[np.argmin(np.linalg.norm(known[:, :2] - place, axis=1))]
 
@@ -152,10 +101,6 @@ def _choose_time_axis(
     """Choose a time axis from path 0 to beyond the farthest by way of anything hidden (n, 3), which
     leads by a corner of the box about it.
     """
-    import numpy as np
-
-    from nlos.capture import TimeAxis
-
     bin_width = settings.bin_width
     require_positive("the bin width", 1e12 * bin_width, "number of picoseconds")
     corners = itertools.product(*zip(hidden.min(axis=0), hidden.max(axis=0), strict=True))
@@ -168,45 +113,28 @@ def _choose_time_axis(
 
 
 @dataclass(frozen=True, eq=False)
-class HiddenTruth:
+class HiddenTruth(Storable):
     """Where hidden things scatter light; it travels inside the file of a simulated capture."""
 
-    positions: FloatArray  # (n, 3), points, or the centres of facets, m
-    spacing: float  # distance of neighbouring facets, m; 0 for points
+    RECORD_KIND = "hidden_scene"
+
+    # (n, 3), points, or the centres of facets, m
+    positions: FloatArray = field(metadata=stored_array("m", "point", "xyz"))
+    # distance of neighbouring facets, m; 0 for points
+    spacing: float = field(metadata=stored_value("spacing_m"))
 
     def attach_to_record(self, capture: Capture) -> Record:
         """Put the truth into the record of its capture."""
-        from tofclip.storage import Field, Record
-
-        own = {"positions": Field(self.positions, "m", ("point", "xyz"))}
-        truth = Record(RECORD_KIND, own, {"spacing_m": self.spacing})
-        return replace(capture.to_record(), children={RECORD_KIND: truth})
+        return replace(capture.to_record(), children={self.RECORD_KIND: self.to_record()})
 
     @classmethod
-    def load(cls, path: Path) -> HiddenTruth | None:
+    def find(cls, path: Path) -> HiddenTruth | None:
         """Read the truth that a capture's file carries; None where there is none."""
-        import numpy as np
-
-        from tofclip.storage import HDF5_SIGNATURE, Record
-
-        if not path.is_file():
-            return None
-        with open(path, "rb") as file:
-            if file.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE:
-                return None
-        try:
-            found = Record.load(path).children.get(RECORD_KIND)
-        except FileFormatError:  # another laboratory's HDF5
-            return None
-        if found is None:
-            return None
-        return cls(found.array("positions", np.float64, 2, "m"), found.number("spacing_m"))
+        found = Record.load(path).children.get(cls.RECORD_KIND) if is_own_file(path) else None
+        return None if found is None else cls.from_record(found)
 
     def mask_near(self, grid: Grid, reach: float) -> BoolArray:
         """Voxels (z, y, x) whose centres lie within `reach` m of something hidden."""
-        import numpy as np
-        from scipy.spatial import cKDTree
-
         require_positive("the reach about hidden things", reach, "number of metres")
         z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
         voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
@@ -218,8 +146,6 @@ def compare_with_truth(volume: Volume, truth: HiddenTruth) -> dict[str, float]:
     """Fraction of the energy near hidden things (``energy_near_truth``), how much brighter it is
     there (``contrast_to_truth``), and how far near is (``truth_reach_m``).
     """
-    import numpy as np
-
     axes = (volume.grid.x, volume.grid.y, volume.grid.z)
     # coarse voxels may have no centre within the radius
     reach = max([TRUTH_RADIUS_M, *(float(axis[1] - axis[0]) for axis in axes if axis.size > 1)])
@@ -241,8 +167,6 @@ def measure_sharpness(volume: Volume) -> float:
     Soc. Am. 64, 1200 (1974), made free of scale. It compares images of one scene on one grid; it
     does not separate right from wrong.
     """
-    import numpy as np
-
     front = volume.maximum_projection().brightness.astype(np.float64)
     total = float(front.sum())
     return front.size * float(np.sum(front**2)) / total**2 if total > 0 else math.nan
@@ -250,7 +174,5 @@ def measure_sharpness(volume: Volume) -> float:
 
 def correlate_views(one: Volume, other: Volume) -> float:
     """Pearson correlation of two volumes' front views, on grids of the same lateral shape."""
-    import numpy as np
-
     first, second = (volume.maximum_projection().brightness.ravel() for volume in (one, other))
     return float(np.corrcoef(first, second)[0, 1])

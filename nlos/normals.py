@@ -18,7 +18,7 @@ from nlos.confocal import (
     transform_paraboloid,
     transform_squared_distances,
 )
-from nlos.export import write_ply
+from nlos.export import require_surface, write_ply
 from nlos.plane import axis_step
 from nlos.volume import Grid, Volume
 from tofclip.arrays import (
@@ -36,6 +36,7 @@ from tofclip.threads import run_blocks
 GRADIENT_VOXELS = 2.0
 # Neighbouring pixels whose depths differ by more, in voxels, are of different things.
 MAX_STEP_VOXELS = 3.0
+MIN_VOXELS = 3  # along every axis, of a volume that has surfaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +93,7 @@ def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
     from scipy.ndimage import gaussian_filter
 
     grid, magnitude = volume.grid, volume.magnitude.astype(np.float64)
-    require_surface(magnitude, fraction)
+    require_surface(magnitude, fraction, MIN_VOXELS)
     gradients = np.gradient(magnitude, grid.z, grid.y, grid.x)
     rows, columns = np.indices(magnitude.shape[1:])
     peak = magnitude.argmax(axis=0)
@@ -120,16 +121,6 @@ def build_front_surface(volume: Volume, normals: AnyArray, fraction: float) -> F
         np.where(seen, albedo, 0).astype(np.float32),
         np.where(seen[..., np.newaxis], normals * towards, np.nan).astype(np.float32),
     )
-
-
-def require_surface(magnitude: NDArray[np.floating], fraction: float) -> None:
-    """Refuse volumes that hold no surface, and fractions that are none."""
-    if not 0 < fraction < 1:
-        raise InputError(
-            f"a surface lies where brightness is a fraction from 0 to 1, got {fraction}"
-        )
-    if min(magnitude.shape) < 3 or not magnitude.any():
-        raise InputError("a surface needs at least 3 voxels along every axis, and light")
 
 
 def _refine_peaks(magnitude: NDArray[np.floating], z: FloatArray) -> FloatArray:
@@ -177,7 +168,7 @@ class DirectionalLightCone:
         scan = ConfocalScan.of(capture, grid)
         vectors = self._deconvolve(scan, grid)
         volume = Volume(np.linalg.norm(vectors, axis=0).astype(np.float32), grid)
-        require_surface(volume.magnitude, fraction)
+        require_surface(volume.magnitude, fraction, MIN_VOXELS)
         peak = volume.magnitude.argmax(axis=0)
         rows, columns = np.indices(peak.shape)
         normals = np.moveaxis(vectors[:, peak, rows, columns], 0, -1)
@@ -227,7 +218,7 @@ def _separate(
 def find_imaged_surface(capture: Capture, volume: Volume, fraction: float = 0.3) -> FrontSurface:
     """Find the front surface of an imaged capture, by the directional transform if that takes it."""
     here, light = volume.on(ComputeDevice()), capture.on(ComputeDevice())
-    require_surface(here.magnitude, fraction)
+    require_surface(here.magnitude, fraction, MIN_VOXELS)
     try:
         return DirectionalLightCone().find_front_surface(light, volume.grid, fraction)
     except InputError:

@@ -1,5 +1,5 @@
-"""Settings of imaging around corners, declared once for the command line and for Python: name, unit,
-meaning and default of each.
+"""Settings of imaging around corners and of simulated scenes, declared once for the command line and for
+Python: name, unit, meaning and default of each.
 
 What is not given is found by `nlos.imaging`. Importing this loads nothing heavy.
 """
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 Limits = tuple[float, float]
 Wanted = TypeVar("Wanted", bound="Settings")
 
+SCANS = ("single", "confocal")
+WALLS = ("planar", "cylinder", "wavy", "relief", "plates")  # those of `nlos.simulate`
+MATERIALS = ("matte", "retroreflecting")
 METHODS = Parts(
     "nlos.methods",
     "method",
@@ -233,6 +236,52 @@ class Settings:
     def to_dict(self) -> dict[str, Any]:
         """Name every setting that has a value."""
         return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """What is hidden before which wall, how it is scanned, and the instrument with its noise. The
+    metadata of each field are those of `nlos.Settings`.
+    """
+
+    letters: str | None = declare_setting(
+        "", "Flat letters, as read from the wall.", shown="T, if nothing else is given"
+    )
+    points: str | None = declare_setting("", "Points that scatter evenly, in m.", shown="none")
+    mesh: str | None = declare_setting(
+        "", "Triangle mesh (.ply, .obj, .stl) in m, in the wall's frame.", shown="none"
+    )
+    depth: float = declare_setting("m", "Depth of the letters.", 1.0)
+    height: float = declare_setting("m", "Height of a capital letter.", 0.7)
+    material: str = declare_setting(
+        "", f"Of letters or mesh: {' or '.join(MATERIALS)}.", "matte", choices=MATERIALS
+    )
+    facet: float = declare_setting(
+        "m", "Size of the facets that letters or mesh are cut into.", 0.025, written="mm"
+    )
+    wall: str = declare_setting(
+        "",
+        "planar, cylinder, wavy, relief (hills) or plates (two, hanging apart).",
+        "cylinder",
+        choices=WALLS,
+    )
+    wall_points: int = declare_setting("1", "Rows of wall points, and columns.", 48)
+    wall_width: float = declare_setting("m", "Width and height of the wall.", 2.0)
+    scan: str = declare_setting("", "single (one laser spot) or confocal.", "single", choices=SCANS)
+    laser: tuple[float, float] = declare_setting(
+        "m", "Where the laser spot is, in m; the nearest wall point is taken.", (0.0, 0.0)
+    )
+    bin_width: float = declare_setting("s", "Duration of a time bin.", 32e-12, written="ps")
+    jitter: float = declare_setting(
+        "s", "Standard deviation of the instrument's response.", 30e-12, written="ps"
+    )
+    peak_counts: float | None = declare_setting(
+        "1", "Expected photons in the brightest bin.", shown="no noise"
+    )
+    background: float = declare_setting(
+        "1", "Expected background counts per bin, with --peak-counts.", 0.0
+    )
+    seed: int = declare_setting("1", "Of the photons' chance.", 0)
 
 
 def list_taken(method: str) -> list[str]:

@@ -511,7 +511,7 @@ def info(
         "resolution_m": {**asdict(compute_diffraction_limit(capture, middle, pulse)), "at": middle},
         "box_m": dict(zip("xyz", found.box, strict=True)),
         "voxels": {"size_mm": shown["voxel_mm"], "shape": grid.shape},
-        "truth": HiddenTruth.load(source) is not None,
+        "truth": HiddenTruth.find(source) is not None,
     }
     memory, refused = try_methods(found, METHODS, capture, grid)
     mib = {name: size / 2**20 for name, size in memory.items()}

@@ -39,8 +39,7 @@ from apps.report import (
     say,
     with_past,
 )
-from nlos.known_scenes import SceneSettings
-from nlos.settings import METHODS, METHODS_BY_SPEED, Settings, list_taken
+from nlos.settings import METHODS, METHODS_BY_SPEED, SceneSettings, Settings, list_taken
 from tofclip.errors import InputError, require_known
 from tofclip.files import PICTURE_SUFFIXES, require_apart
 
@@ -318,7 +317,7 @@ def compare(
     if volumes is not None:
         require_apart([volumes, *(volumes / f"{name}.h5" for name in METHODS)], [source, settings])
         make_folder(volumes)
-    capture, truth = read_capture(source), HiddenTruth.load(source)
+    capture, truth = read_capture(source), HiddenTruth.find(source)
     # The voxels are those of the virtual pulse, for all methods alike.
     prepared = prepare_imaging(capture, wanted)
     ours, grid = prepared.capture, prepared.grid

@@ -40,7 +40,6 @@ from nlos.phasor.propagate import (
     WallToPlane,
     plan_wall_to_plane,
     require_in_front,
-    require_propagation,
     require_tolerance,
 )
 from nlos.phasor.wall_to_plane import WallBeforePlane
@@ -53,7 +52,7 @@ from nlos.plane import (
 )
 from nlos.volume import Grid, Volume
 from tofclip.arrays import Array, Float32Array, FloatArray
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_known
 
 # Per voxel: a complex64 sum, and, at most, the images of the depths from which the others follow; and
 # per sample of the signal.
@@ -398,7 +397,7 @@ class Hybrid(WaveMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_propagation(self.propagation)
+        require_known("propagation", self.propagation, WALL_TO_PLANE_TIME_FRACTIONS)
 
     @property
     def settings(self) -> dict[str, str | float]:

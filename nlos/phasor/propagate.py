@@ -35,7 +35,7 @@ from nlos.phasor.wall_to_plane import WallBeforePlane, WallToPlanePlan, has_finu
 from nlos.plane import Plane, PlaneField, WallLattice
 from nlos.volume import Grid
 from tofclip.arrays import Array, ComplexArray, Float32Array, FloatArray, is_numpy, to_numpy
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_known
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 
 Propagation = Literal["spectral", "time"]
@@ -283,53 +283,38 @@ def sum_waves_on_device(
     return xp.reshape(field[:, : waves.count], (*shape, waves.count))
 
 
-class SpectralPropagation:
-    """Phasors of wall points, carried onto a plane the faster way that keeps the tolerance: by direct
-    sums, or by Fourier transforms, whose terms are chosen for the spectrum of the first phasors that
-    come and stay for later ones. `waves`: from points; `library`: of the phasors, none for NumPy's.
+def choose_propagation(
+    geometry: WallBeforePlane,
+    waves: SphericalWaves,
+    tolerance: float,
+    library: ArrayLibrary | None,
+    phasors: Array,
+) -> Callable[[Array, Progress], Array]:
+    """Return the faster way that keeps the tolerance from phasors (n, frequencies) of wall points to the
+    field (y, x, frequencies) on a plane, whose values progress counts: direct sums, or Fourier
+    transforms, whose terms are chosen for the spectrum of these `phasors`. `library`: theirs, none for
+    NumPy.
     """
+    sample = phasors[slice(None, None, phasors.shape[0] // STRENGTH_POINTS + 1), :]
+    strength = estimate_strength(sample if library is None else to_numpy(sample))
+    scattered = library is None and has_finufft()
+    with limit_blas_threads():
+        plan = plan_transforms(geometry, waves, strength, tolerance, scattered)
+    if library is not None:
+        carry = partial(sum_waves_on_device, geometry, waves, library)
+        on_lattice = plan and DevicePropagation(plan, library).field
 
-    def __init__(
-        self,
-        geometry: WallBeforePlane,
-        waves: SphericalWaves,
-        tolerance: float,
-        library: ArrayLibrary | None,
-    ) -> None:
-        self.geometry, self.waves, self.tolerance = geometry, waves, tolerance
-        self.library = library
-        self._propagate: Callable[[Array, Progress], Array] | None = None
+        def carry_at_once(phasors: Array, progress: Progress) -> Array:
+            field = (on_lattice or carry)(phasors)
+            progress(math.prod(field.shape))
+            return field
 
-    def field(self, phasors: Array, progress: Progress = ignore_progress) -> Array:
-        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies); progress
-        counts its values.
-        """
-        self._propagate = self._propagate or self._choose(phasors)
-        return self._propagate(phasors, progress)
-
-    def _choose(self, phasors: Array) -> Callable[[Array, Progress], Array]:
-        geometry, waves, library = self.geometry, self.waves, self.library
-        some = slice(None, None, phasors.shape[0] // STRENGTH_POINTS + 1)
-        sample = phasors[some, :]
-        strength = estimate_strength(sample if library is None else to_numpy(sample))
-        scattered = library is None and has_finufft()
-        with limit_blas_threads():
-            plan = plan_transforms(geometry, waves, strength, self.tolerance, scattered)
-        if library is not None:
-            carry = partial(sum_waves_on_device, geometry, waves, library)
-            on_lattice = plan and DevicePropagation(plan, library).field
-
-            def carry_at_once(phasors: Array, progress: Progress) -> Array:
-                field = (on_lattice or carry)(phasors)
-                progress(math.prod(field.shape))
-                return field
-
-            return carry_at_once
-        if plan is not None:
-            return partial(propagate_low_rank, plan)
-        return lambda phasors, progress: propagate_direct(
-            geometry.points, phasors, geometry.plane, waves.wavenumbers, progress
-        )
+        return carry_at_once
+    if plan is not None:
+        return partial(propagate_low_rank, plan)
+    return lambda phasors, progress: propagate_direct(
+        geometry.points, phasors, geometry.plane, waves.wavenumbers, progress
+    )
 
 
 Diffraction = CompiledDiffraction | PortableDiffraction
@@ -407,7 +392,7 @@ def propagate(
             f"{len(groups)} laser spots make as many fields: propagate the wall points of one at a time"
         )
     require_tolerance(tolerance)
-    require_propagation(propagation)
+    require_known("propagation", propagation, get_args(Propagation))
     group, band = groups[0], Band(pulse, capture.axis)
     wall = WallBeforePlane.of(capture.points[group.indices], plane)
     how = Backend(band, capture), propagation, tolerance
@@ -438,11 +423,14 @@ def plan_wall_to_plane(
             return propagate_in_time(points, traces, plane, band, group.legs, progress)
 
         return shift_and_sum
-    waves = build_waves(group, band, continued=False)
-    propagated = SpectralPropagation(geometry, waves, tolerance, backend.library)
+    how = geometry, build_waves(group, band, continued=False), tolerance, backend.library
+    chosen: list[Callable[[Array, Progress], Array]] = []  # by the first phasors that come
 
     def propagate_spectrum(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
-        return propagated.field(backend.compute_phasors(one, group), progress)
+        phasors = backend.compute_phasors(one, group)
+        if not chosen:
+            chosen.append(choose_propagation(*how, phasors))
+        return chosen[0](phasors, progress)
 
     return propagate_spectrum
 
@@ -489,14 +477,6 @@ def require_in_front(z: float, points: FloatArray) -> None:
     if z <= foremost:
         raise InputError(
             f"the virtual plane must lie in front of the wall, which reaches up to z = {foremost:.4g} m"
-        )
-
-
-def require_propagation(propagation: str) -> None:
-    """Refuse a word that is not a propagation from wall to plane."""
-    if propagation not in get_args(Propagation):
-        raise InputError(
-            f"propagation must be one of {', '.join(get_args(Propagation))}, got '{propagation}'"
         )
 
 

@@ -77,7 +77,7 @@ def test_the_hidden_letters_on_a_coarser_wall(hidden_letters, letters_folder):
     assert flat["energy_near_truth"] < hybrid["energy_near_truth"]
     written = {"capture.h5", "hybrid.h5", "backprojection.h5", "nlos_demo.png"}
     assert {path.name for path in letters_folder.iterdir()} == written
-    assert HiddenTruth.load(letters_folder / "capture.h5") is not None
+    assert HiddenTruth.find(letters_folder / "capture.h5") is not None
 
 
 @pytest.mark.nightly

@@ -32,7 +32,7 @@ def pair(kind=Volume):
 
 class TestSimulate:
     def test_the_capture_carries_its_truth_and_its_settings(self, curved):
-        capture, truth = Capture.load(curved), HiddenTruth.load(curved)
+        capture, truth = Capture.load(curved), HiddenTruth.find(curved)
         np.testing.assert_array_equal(truth.positions, [HIDDEN_POINT])
         assert capture.signal.shape[1:] == (24, 24)
         assert capture.provenance["settings"]["wall"] == "cylinder"
@@ -53,7 +53,7 @@ class TestSimulate:
     def test_letters_before_two_plates(self, shell):
         words = "--letters L --wall plates --wall-points 9 --facet-mm 60 --laser-m -0.5 0"
         found = shell.figures(f"nlos simulate {words} --out plates.h5")
-        capture, truth = Capture.load("plates.h5"), HiddenTruth.load(Path("plates.h5"))
+        capture, truth = Capture.load("plates.h5"), HiddenTruth.find(Path("plates.h5"))
         # the middle column hangs in the gap
         assert found["wall_points"] == np.isfinite(capture.wall[..., 0]).sum() == 72
         assert any(np.array_equal(capture.laser, point) for point in capture.points)  # on the wall
@@ -73,7 +73,7 @@ class TestSimulate:
             file["data"] = [1.0]
         (tmp_path / "text.npz").write_text("no HDF5")
         for path in (tmp_path / "foreign.h5", tmp_path / "text.npz", files / "streak.h5", tmp_path):
-            assert HiddenTruth.load(path) is None
+            assert HiddenTruth.find(path) is None
         with pytest.raises(InputError, match="reach"):
             HiddenTruth(np.zeros((1, 3)), 0.0).mask_near(Grid([0.0], [0.0], [0.0]), 0.0)
 

@@ -23,7 +23,7 @@ from apps.report import build_provenance, make_folder, report, require_writable,
 from apps.verbs.nlos import ReconstructSettings
 from apps.verbs.nlos_imaging import CompareSettings
 from nlos import simulate
-from nlos.known_scenes import WALLS, SceneSettings
+from nlos.settings import WALLS, SceneSettings
 from tofclip import Frames, Streak
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.notebook import save_figure

@@ -78,7 +78,7 @@ DARK, FLAT = Volume(np.zeros(GRID.shape), GRID), Grid(GRID.x, GRID.y, GRID.z[:2]
     [
         (DARK, 0.3, "and light"),
         (Volume(np.ones(FLAT.shape), FLAT), 0.3, "3 voxels along every axis"),
-        (DARK, 1.5, "a fraction from 0 to 1"),
+        (DARK, 1.5, "a fraction between 0 and 1"),
     ],
 )
 def test_what_shows_no_surface_is_refused(volume, fraction, reason):
