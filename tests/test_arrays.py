@@ -1,17 +1,10 @@
-"""Arrays of other libraries: recognised, fetched, put back, refused; and nothing hides on the
-processor.
+"""Arrays of other libraries: recognised, fetched, put back, refused."""
 
-The second half works on a device of array-api-strict that mixes with no other and gives NumPy
-nothing. So would a graphics processor: whatever stays behind on the processor, or is fetched in
-passing, ends in an error. What is fetched on purpose is counted.
-"""
-
-import sys
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
+from array_places import find_device
 
 from tofclip import arrays
 from tofclip.arrays import (
@@ -25,36 +18,15 @@ from tofclip.arrays import (
 from tofclip.camera import Camera
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.lidar import Detection, depth
-from tofclip.operators import (
-    BlockDiagonal,
-    Diagonal,
-    Integration,
-    LineProjection,
-    Reshape,
-    Stack,
-)
 from tofclip.shots import Frames
-from tofclip.solvers import (
-    Backprojection,
-    Huber,
-    LinearInverse,
-    Poisson,
-    Sparse,
-    TotalVariation,
-    relative_residual,
-)
 
 strict = pytest.importorskip("array_api_strict")
-HERE = strict.Device("CPU_DEVICE")
 VALUES = np.arange(6, dtype=np.float32).reshape(2, 3)
 
 
 @pytest.fixture(params=["array_api_strict", "torch"])
 def device(request):
-    if request.param == "array_api_strict":
-        return ComputeDevice("array_api_strict", HERE)
-    pytest.importorskip("torch", reason="PyTorch is optional")
-    return parse_device("torch:cpu")
+    return find_device(request.param)
 
 
 class TestDevice:
@@ -145,115 +117,25 @@ def test_frames_of_other_libraries_are_checked_and_saved(device, tmp_path):
         depth(Frames(device.put(values[:2]), there.times[:2], camera))
 
 
-OTHER_DEVICE = ComputeDevice("array_api_strict", strict.Device("device1"))
-ANGLES = np.deg2rad([-38.0, -20.0, 2.0, 21.0, 40.0])
-CENTRES = np.linspace(20.0, 100.0, 5)
-PROJECTION = LineProjection((16, 15), 120, CENTRES, ANGLES, np.ones(5))
-FRAMES, ITERATIONS = 4, 20
-# Numbers that a solver fetches, of each frame: the peak of A'f, by which a weight is relative; the
-# peak of the data term's gradient, where that is not least squares, by which dark frames are known;
-# and the term's value for a picture of nothing. Then the objective before and after each iteration,
-# all frames together.
-LEAST_SQUARES = [FRAMES, FRAMES, ITERATIONS + 1]
-OTHER_TERM = [FRAMES, *LEAST_SQUARES]
-POISSON = partial(Poisson, deviation=np.full(120, 1.0))
+def test_what_the_device_of_other_tests_gives_is_fetched_on_purpose_only():
+    there = find_device("array_api_strict").put(VALUES)
+    with pytest.raises(ValueError, match="different devices"):
+        _ = there + strict.ones(3, dtype=strict.float32)
+    with pytest.raises(RuntimeError, match="convert array on the 'array_api_strict"):
+        np.asarray(there)
 
 
-def brought_here(array):
-    return np.asarray(array.to_device(HERE))
-
-
-class TestOtherDevice:
-    @pytest.fixture(autouse=True)
-    def fetched(self, monkeypatch):
-        """Sizes of what is fetched on purpose."""
-        sizes = []
-
-        def fetch(array):
-            if isinstance(array, np.ndarray):
-                return array
-            sizes.append(array.size)
-            return brought_here(array)
-
-        for name, module in list(sys.modules.items()):
-            if name.startswith("tofclip.") and getattr(module, "to_numpy", None) is to_numpy:
-                monkeypatch.setattr(module, "to_numpy", fetch)
-        return sizes
-
-    def test_it_is_as_strict_as_it_is_meant_to_be(self):
-        there = OTHER_DEVICE.put(np.ones(3, np.float32))
-        with pytest.raises(ValueError, match="different devices"):
-            _ = there + strict.ones(3, dtype=strict.float32)
-        with pytest.raises(RuntimeError, match="convert array on the 'array_api_strict"):
-            np.asarray(there)
-
-    @pytest.mark.parametrize(
-        "operator",
-        [
-            PROJECTION,
-            Diagonal(np.linspace(0, 2, 120)) @ PROJECTION,
-            Stack([PROJECTION, PROJECTION]),
-            BlockDiagonal([PROJECTION, PROJECTION]),
-            Integration([PROJECTION, PROJECTION]),
-            Reshape((120,), (10, 12)) @ PROJECTION,
-            PROJECTION.H,
-        ],
-        ids=lambda operator: type(operator).__name__,
-    )
-    def test_operators(self, operator, fetched):
-        random = np.random.default_rng(1)
-        for apply, shape in ((operator, operator.shape_in), (operator.adjoint, operator.shape_out)):
-            operand = random.random((*shape, 3), np.float32)
-            there = apply(OTHER_DEVICE.put(operand))
-            np.testing.assert_allclose(brought_here(there), apply(operand), rtol=1e-4)
-        assert fetched == []
-
-    @pytest.mark.parametrize(
-        ("method", "fetches"),
-        [
-            (Sparse(iterations=ITERATIONS), LEAST_SQUARES),
-            (TotalVariation(iterations=ITERATIONS, tolerance=1e-9), LEAST_SQUARES),
-            (
-                Sparse(iterations=ITERATIONS, data_term=partial(Huber, threshold=5.0)),
-                OTHER_TERM,
-            ),
-            (TotalVariation(iterations=ITERATIONS, data_term=POISSON), OTHER_TERM),
-            (LinearInverse(), [120]),  # which measurements are dead, before it is prepared
-            (Backprojection(), []),
-        ],
-    )
-    def test_recovery(self, method, fetches, fetched):
-        """A few numbers for each frame are fetched, whatever its size, and nothing in an
-        iteration.
-        """
-        random, square = np.random.default_rng(5), np.zeros((16, 15, 1))
-        square[4:11, 5:10] = 100
-        light = PROJECTION(square * random.uniform(0.5, 1, FRAMES))
-        noisy = light + random.normal(0, 2, (120, FRAMES))
-        measurements = np.maximum(noisy, 0).astype(np.float32)
-        valid = random.random((120, FRAMES)) > 0.03
-        expected = method.recover(PROJECTION, measurements, valid).frames
-        there = OTHER_DEVICE.put(measurements), OTHER_DEVICE.put(valid)
-        frames = method.recover(PROJECTION, *there).frames
-        assert fetched == fetches
-        assert np.linalg.norm(brought_here(frames) - expected) < 1e-4 * np.linalg.norm(expected)
-        residual = relative_residual(PROJECTION, expected, measurements, valid)
-        found = relative_residual(PROJECTION, frames, *there)
-        assert found == pytest.approx(residual, rel=1e-4)
-
-    def test_the_search_for_returns(self):
-        """Frames are fetched on purpose, and the same returns found."""
-        random = np.random.default_rng(2)
-        times = 10e-9 + 20e-12 * np.arange(90)
-        arrival = random.uniform(times[5], times[-5], (2, 12, 9))
-        pulses = np.exp(-4 * np.log(2) * ((times[:, None, None, None] - arrival) / 60e-12) ** 2)
-        values = (300 * pulses).sum(axis=1) + random.normal(5, 2, (90, 12, 9))
-        camera = Camera(CENTRES, ANGLES, (12, 9), 120, pulse_fwhm=60e-12)
-        frames = Frames(values.astype(np.float32), times, camera)
-        detection = Detection(min_scene_fraction=0, min_time_bin_fraction=0)
-        expected = depth(frames, detection=detection)
-        assert len(expected) > 108
-        there = replace(frames, values=OTHER_DEVICE.put(frames.values))
-        found = depth(there, detection=detection)
-        np.testing.assert_array_equal([found.y, found.x], [expected.y, expected.x])
-        np.testing.assert_array_equal(found.time, expected.time)
+def test_the_search_for_returns(device):
+    random = np.random.default_rng(2)
+    times = 10e-9 + 20e-12 * np.arange(90)
+    arrival = random.uniform(times[5], times[-5], (2, 12, 9))
+    pulses = np.exp(-4 * np.log(2) * ((times[:, None, None, None] - arrival) / 60e-12) ** 2)
+    values = (300 * pulses).sum(axis=1) + random.normal(5, 2, (90, 12, 9))
+    camera = Camera([20.0], [0.1], (12, 9), 41, pulse_fwhm=60e-12)
+    frames = Frames(values.astype(np.float32), times, camera)
+    detection = Detection(min_scene_fraction=0, min_time_bin_fraction=0)
+    expected = depth(frames, detection=detection)
+    assert len(expected) > 108
+    found = depth(replace(frames, values=device.put(frames.values)), detection=detection)
+    np.testing.assert_array_equal([found.y, found.x], [expected.y, expected.x])
+    np.testing.assert_array_equal(found.time, expected.time)

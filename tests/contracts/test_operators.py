@@ -7,7 +7,7 @@ On NumPy's arrays all of them, those that are portable on the arrays of other li
 import numpy as np
 import pytest
 import scipy.sparse
-from array_places import DEVICE_NAMES, find_device
+from array_places import DEVICE_NAMES, FETCHED, find_device
 
 from nlos import Capture, Grid, Hybrid
 from nlos.refinement.l1 import WallModel
@@ -245,10 +245,10 @@ def test_other_libraries_get_what_numpy_gets(name, library):
     operator = PORTABLE[name](np.float32)
     x, y = (array.astype(np.float32) for array in random_pair(operator, (5,)))
     x_there, y_there = put(library, x, y)
-    for there, here in (
-        (operator(x_there), operator(x)),
-        (operator.adjoint(y_there), operator.adjoint(y)),
-    ):
+    FETCHED.clear()
+    seen, back = operator(x_there), operator.adjoint(y_there)
+    assert FETCHED == []
+    for there, here in ((seen, operator(x)), (back, operator.adjoint(y))):
         # Sums of up to some hundred terms in float32, added in another order.
         np.testing.assert_allclose(to_numpy(there), here, rtol=1e-5, atol=1e-5 * np.abs(here).max())
 

@@ -13,6 +13,7 @@ from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Detection, Pulse, Returns, depth
 from tofclip.lidar.fit_kernels import take_gauss_newton_step
+from tofclip.lidar.pulse import PhaseTable
 from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -61,6 +62,44 @@ def test_a_single_pulse_is_located_far_below_a_bin(position, height, unevenness,
     # float32 traces and the linear pulse table leave 1e-4 bin; 2e-3 bin (6 um) is asked for
     assert returns.range[0] == pytest.approx(range_of(arrival), abs=2e-3 * BIN_M)
     assert returns.time[0] == pytest.approx(arrival, abs=2e-3 * BIN)
+
+
+def look(arrivals_bins, times, noise=0.0):
+    """One return in each pixel, this many bins after the first."""
+    values = gaussian(times, times[0] + BIN * arrivals_bins, 100.0) + 3.0
+    return frames_of(values + noise * np.random.default_rng(0).normal(0, 1, values.shape), times)
+
+
+def test_a_return_is_where_it_arrives_whatever_part_of_a_bin_that_is():
+    arrivals, times = 30 + np.linspace(-0.5, 0.5, 64), even_times(60)
+    found = depth(look(arrivals, times), detection=EVERYTHING)
+    assert len(found) == 64
+    # (1 / 128)^2 of a bin, and the background's 3 counts in single precision
+    np.testing.assert_allclose((found.time - times[0]) / BIN, arrivals, atol=2e-4)
+
+
+@pytest.mark.parametrize("apart", [4.5, 6.0, 8.0, None])
+def test_the_fit_by_a_table_agrees_with_the_exact_one_which_an_uneven_axis_needs(apart):
+    """A dim return on the slope of a bright one as well: what that leaves must be right."""
+    arrivals, times = np.random.default_rng(2).uniform(20, 30, 64), even_times(60)
+    # a last bin that is longer, far from all light: the axis is uneven, and the fit exact
+    uneven = np.append(times[:-1], times[-1] + 0.3 * BIN)
+    assert PhaseTable.tabulate(Pulse.gaussian(FWHM), uneven).half == 0
+    found = []
+    for axis in (times, uneven):
+        frames = look(arrivals, axis, 1.0)
+        if apart is not None:
+            dim = np.float32(0.3) * look(arrivals + apart, axis).values
+            frames = replace(frames, values=frames.values + dim)
+        found.append(depth(frames, detection=EVERYTHING))
+    by_table, exact = found
+    assert len(by_table) == len(exact) >= (64 if apart is None else 126)
+    off = np.abs(by_table.time - exact.time) / BIN
+    # where the last step is shorter than 5e-3 bins, one more would be a part of that
+    assert np.median(off) < 1 / 128**2 * 10
+    assert off.max() < 5e-3
+    np.testing.assert_allclose(by_table.intensity, exact.intensity, rtol=5e-3)
+    np.testing.assert_allclose(by_table.confidence, exact.confidence, rtol=2e-2)
 
 
 def test_background_neither_shifts_nor_brightens_a_return():
