@@ -161,28 +161,6 @@ def test_sweeps_by_hand(sweep, rectified, raw):
     assert tuple(map(float, found)) == pytest.approx(raw, abs=1e-12)
 
 
-@pytest.mark.parametrize("sweep", [None, SKEW, POLYNOMIAL, PROJECTIVE])
-def test_a_camera_and_its_sweep_survive_their_file(tmp_path, sweep):
-    arrays = {
-        "gains": [0.9, 1.0, 1.1],
-        "dead_columns": np.arange(101) == 17,
-        "centre_uncertainty_px": [0.1, 0.2, 0.3],
-        "angle_uncertainty": [0.01, 0.02, 0.03],
-    }
-    numbers = {"time_zero": -1.5e-9, "pulse_fwhm": 7e-11, "focal_length_px": 400.5}
-    made = camera(sweep=sweep, **arrays, **numbers)
-    made.save(tmp_path / "camera.h5")
-    back = Camera.load(tmp_path / "camera.h5")
-    for name in ("centres_px", "angles", "view_positions", *arrays):
-        np.testing.assert_array_equal(getattr(back, name), getattr(made, name))
-    for name in ("image_shape", "slit_width_px", *numbers):
-        assert getattr(back, name) == getattr(made, name)
-    assert type(back.sweep) is type(sweep)
-    if sweep is not None:
-        here = np.array([3.0, 99.0]), np.array([250.0, 17.0])
-        np.testing.assert_array_equal(back.sweep.raw_position(*here), sweep.raw_position(*here))
-
-
 def test_other_files_are_no_camera(tmp_path):
     (tmp_path / "camera.h5").write_bytes(b"not a camera")
     with pytest.raises(FileFormatError, match="not an HDF5 file"):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from tofclip.camera import Camera, SkewSweep
+from tofclip.camera import Camera
 from tofclip.errors import (
     FileFormatError,
     InputError,
@@ -16,7 +16,6 @@ from tofclip.errors import (
 )
 from tofclip.io import read_streak
 from tofclip.shots import Frames, Streak
-from tofclip.storage import Field, Record
 
 
 @pytest.fixture
@@ -146,28 +145,12 @@ def test_files_that_are_no_streak_image_are_refused(tmp_path, make, fault, probl
         read_streak(tmp_path / "shot.tif")
 
 
-def test_our_own_file_brings_everything_back(tmp_path, pixels):
-    sweep = SkewSweep([8.0, 21.5], [0.5, -1.0], [0.0, 0.01])
-    camera = Camera([8.0, 21.5], [0.1, -0.2], (9, 11), 30, sweep=sweep)
-    wall = Record("relay_wall", {"laser": Field(np.ones(3), "m")}, {"row_offset": 25})
-    shot = Streak(
-        counts=pixels,
-        row_times=np.cumsum(np.linspace(18e-12, 20e-12, 20)),
-        saturated=pixels > 3900,
-        metadata={"Streak camera/Time Range": "20 ns", "Comment/UserComment": ""},
-        camera=camera,
-        attachments={"relay_wall": wall},
-        provenance={"settings": {"a": 1}},
-    )
-    shot.save(tmp_path / "without_suffix")
+def test_our_own_file_is_known_whatever_its_name(tmp_path, pixels):
+    past = {"settings": {"a": 1}}
+    Streak(pixels, 20e-12 * np.arange(20), provenance=past).save(tmp_path / "without_suffix")
     got = read_streak(tmp_path / "without_suffix")
-    for name in ("counts", "times", "saturated"):
-        np.testing.assert_array_equal(getattr(got, name), getattr(shot, name))
-    assert got.metadata == shot.metadata
-    np.testing.assert_array_equal(got.camera.centres_px, camera.centres_px)
-    np.testing.assert_array_equal(got.camera.sweep.offsets_bin, [0.5, -1.0])
-    assert got.attachments["relay_wall"].attributes == {"row_offset": 25}
-    assert got.provenance["earlier"] == {"settings": {"a": 1}}
+    np.testing.assert_array_equal(got.counts, pixels)
+    assert got.provenance["earlier"] == past
 
 
 def test_provenance_names_file_and_bin_width(plain):

@@ -21,7 +21,6 @@ from tofclip.light_field import (
 )
 from tofclip.light_field.views import (
     CameraSetup,
-    ClipMeasurement,
     corrupt_measurement,
     measure,
 )
@@ -42,7 +41,6 @@ from tofclip.simulate.patterns import (
     make_text_pattern,
 )
 from tofclip.simulate.scenes import SCENES, edit_scene, make_scene, remove_occluder
-from tofclip.storage import Record
 
 ARRAY = CameraArray((40, 48), 4, focal_length_px=60.0, view_step=0.05, samples=2)
 HEAD_ON = (0.0, 0.0, -1.0)
@@ -190,14 +188,7 @@ def test_refocusing_at_the_cards_depth_makes_it_sharp():
     np.testing.assert_allclose(elsewhere, LIGHT_FIELD.pictures[6], atol=1e-6)
 
 
-@pytest.mark.parametrize("encoder", ["line", "single-pixel"])
-def test_a_measurement_survives_its_file(encoder, tmp_path):
-    made = encode(encoder, 0.5, 7)
-    made.save(tmp_path / "m.h5")
-    back = ClipMeasurement.from_record(Record.load(tmp_path / "m.h5", "clip_measurement"))
-    np.testing.assert_array_equal(back.values, made.values)
-    assert (back.setup, back.image_shape) == (made.setup, made.image_shape)
-    # the older name of even angles is still read
+def test_the_older_name_of_even_angles_is_still_read():
     assert CameraSetup("line-spread", 0.5, 0) == CameraSetup("line-even", 0.5, 0)
 
 

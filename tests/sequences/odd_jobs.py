@@ -5,7 +5,6 @@ name.
 import os
 import resource
 import signal
-import time
 from functools import partial
 
 from tofclip.errors import InputError
@@ -18,16 +17,6 @@ def square(number, result):
     with atomic_path(result) as temporary:
         temporary.write_text(str(number**2))
     return number**2
-
-
-def meet(own, other):
-    """Write a result and wait for another job's: both can end only at work at the same time."""
-    square(0, own)
-    deadline = time.monotonic() + 60
-    while not other.exists():
-        if time.monotonic() > deadline:
-            raise InputError(f"{other.name} never came")
-        time.sleep(0.01)
 
 
 def refuse(result):

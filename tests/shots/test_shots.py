@@ -1,15 +1,12 @@
 """Frames keep their axes, camera and attachments; a streak image is checked once, at construction."""
 
-import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import FileFormatError, InputError, MissingTimeAxisError, ShapeError
 from tofclip.shots import Frames, Returns, Streak
-from tofclip.storage import Field, Record
+from tofclip.storage import Record
 
 CAMERA = Camera(
     [8.0, 21.5], [0.1, -0.2], (5, 6), 30, gains=[0.9, 1.1], sweep=SkewSweep([8.0], [0.5], [0.01])
@@ -19,23 +16,8 @@ VALUES = np.random.default_rng(2).normal(size=(4, 5, 6)).astype(np.float32)
 TIMES = np.array([10.0, 11.0, 13.0, 16.0]) * 1e-12
 
 
-def test_frames_survive_their_file(tmp_path):
-    figures = {"relative_residual": 0.08, "method": "tv", "iterations": 60}
-    wall = {"relay_wall": Record("relay_wall", {"laser": Field(np.ones(3), "m", ("xyz",))})}
-    past = {"settings": {"seed": 1}}
-    expected = Frames(VALUES, TIMES, CAMERA, figures, attachments=wall, provenance=past)
-    expected.save(tmp_path / "frames.h5")
-    got = Frames.load(tmp_path / "frames.h5")
-    np.testing.assert_array_equal(got.values, VALUES)
-    assert got.values.dtype == np.float32
-    np.testing.assert_array_equal(got.times, TIMES)
-    assert got.figures == expected.figures
-    np.testing.assert_array_equal(got.camera.gains, [0.9, 1.1])
-    assert got.camera.image_shape == (5, 6)
-    laser = got.attachments["relay_wall"].array("laser", np.float64, 1, "m")
-    np.testing.assert_array_equal(laser, np.ones(3))
-    assert list(got.attachments) == ["relay_wall"]
-    assert got.provenance == {"settings": {"seed": 1}}
+def test_files_of_frames_say_units_and_axes_and_are_a_camera_s_too(tmp_path):
+    Frames(VALUES, TIMES, CAMERA).save(tmp_path / "frames.h5")
     fields = Record.load(tmp_path / "frames.h5", "frames").fields
     assert (fields["values"].units, fields["values"].axes) == ("count", ("time", "y", "x"))
     assert (fields["times"].units, fields["times"].axes) == ("s", ("time",))
@@ -92,28 +74,6 @@ def test_frames_take_their_returns_along():
 
 
 COUNTS = np.arange(12.0).reshape(3, 4)
-texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=15)
-shapes = hnp.array_shapes(min_dims=2, max_dims=2, max_side=6)
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(shape=shapes, metadata=st.dictionaries(texts, texts, max_size=4), data=st.data())
-def test_a_streak_survives_its_file(shape, metadata, data, tmp_path):
-    counts = data.draw(
-        hnp.arrays(np.float32, shape, elements=st.floats(-1000, 70000, width=32)).filter(np.any)
-    )
-    steps = data.draw(st.none() | hnp.arrays(np.float64, shape[0], elements=st.floats(1e-12, 1e-9)))
-    saturated = data.draw(st.none() | hnp.arrays(bool, shape))
-    expected = Streak(counts, None if steps is None else np.cumsum(steps), saturated, metadata)
-    expected.save(tmp_path / "a.h5")
-    got = Streak.load(tmp_path / "a.h5")
-    np.testing.assert_array_equal(got.counts, expected.counts)
-    for name in ("row_times", "saturated"):
-        assert (getattr(got, name) is None) == (getattr(expected, name) is None)
-        if getattr(expected, name) is not None:
-            np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
-    assert got.metadata == metadata
-    assert got.source == str(tmp_path / "a.h5")
 
 
 @pytest.mark.parametrize(
