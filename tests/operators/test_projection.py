@@ -52,16 +52,6 @@ def lines(shape, slit, *views):
     return LineProjection(shape, slit, *zip(*views, strict=True), np.float64)
 
 
-@pytest.mark.parametrize("shape", [(20, 20), (21, 20), (20, 21), (21, 21)])
-def test_the_optical_axis_of_even_and_odd_pictures_is_their_middle_pixel(shape):
-    projection = lines(shape, 101, (50.0, 0.5, 1.0))
-    for row, column in ((10, 10), (3, 5), (0, 19)):
-        picture = np.zeros(shape)
-        picture[row, column] = 1
-        expected = 50 + (column - 10) - (row - 10) * np.tan(0.5)
-        assert centroid(projection(picture)) == pytest.approx(expected, abs=1e-12)
-
-
 def test_overlapping_views_add_their_light():
     picture, views = draw(1, 15, 15), ((15.2, 0.3, 1.0), (22.9, -0.4, 0.7))
     alone = [lines((15, 15), 40, view)(picture) for view in views]
