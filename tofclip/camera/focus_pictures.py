@@ -28,25 +28,12 @@ MIN_DOT_SNR = 8.0  # standard deviations of the picture's noise
 
 @dataclass(frozen=True)
 class FocusCalibration:
-    """What the four pictures say about a camera.
-
-    Parameters
-    ----------
-    centres_px, angles : (views,) array
-        Slit columns (0-based) and angles from the vertical, rad, positive where the column grows
-        with the row.
-    centre_uncertainty_px, angle_uncertainty : (views,) array
-        One standard deviation.
-    dot_rows_px : (views,) array
-        Row of each dot: the slit is not exactly horizontal.
-    line_rows_px : (views, 2) array
-        First and last row of each line.
-    line_columns_px : (views,) array
-        Column where the fitted line crosses the dot's row.
-    signal : (rows, columns) array
-        Background-subtracted line picture, for drawing.
-    dots : (rows, columns) array
-        Background-subtracted dot picture, for drawing.
+    """What the four pictures say about a camera, of each view: `centres_px`, slit columns (0-based), and
+    `angles` from the vertical, rad, positive where the column grows with the row, with their standard
+    deviations, `centre_uncertainty_px` and `angle_uncertainty`; `dot_rows_px`, row of the dot, as the
+    slit is not exactly horizontal; `line_rows_px` (views, 2), first and last row of the line;
+    `line_columns_px`, where it crosses the dot's row. `signal` and `dots` (rows, columns) are the
+    pictures without background, for drawing.
     """
 
     centres_px: FloatArray

@@ -45,16 +45,9 @@ MAX_FLIGHT_PER_SHOT = 100.0
 
 @dataclass(frozen=True)
 class Shot:
-    """A streak image together with what is known about the camera that took it.
-
-    Parameters
-    ----------
-    streak : Streak
-        With a time axis.
-    camera : Camera
-        With the time zero that holds for this shot. Its sweep may be unknown; see `fit_camera`.
-    calibrated_px : (views,) array, optional
-        Slit centres as they were calibrated, where the camera was fitted to the shot since.
+    """A `streak` image with a time axis, and what is known about its `camera`, which has the time zero
+    that holds for this shot; its sweep may be unknown, see `fit_camera`. `calibrated_px` (views,) are
+    the slit centres as they were calibrated, where the camera was fitted to the shot since.
     """
 
     streak: Streak

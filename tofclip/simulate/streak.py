@@ -317,20 +317,11 @@ MIN_REFLECTANCE = 0.1  # a surface that reflects less says too little about wher
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """The reference view, pixel by pixel.
-
-    Parameters
-    ----------
-    range : (y, x) float32 array
-        Distance along the line of sight, m, of the plate that fills most of the pixel; NaN where
-        there is none.
-    reflectance : (y, x) float32 array
-        Diffuse reflectance times the cosine of incidence, averaged over the pixel.
-    target : (y, x) bool array
-        Pixels whose range can be asked for: the pixel and its eight neighbours lie on one and the
-        same plate, with a reflectance of at least 0.1 everywhere.
-    bin_width : float
-        Duration of a bin of the shot, s, which sets the scale of range errors.
+    """The reference view, (y, x): `range` along the line of sight, m, of the plate that fills most of the
+    pixel, NaN where there is none; `reflectance`, times the cosine of incidence, averaged over the
+    pixel; `target`, whether the range can be asked for: the pixel and its eight neighbours lie on one
+    plate, with a reflectance of at least 0.1 everywhere. `bin_width` of the shot, s, sets the scale of
+    range errors.
     """
 
     range: Float32Array
@@ -437,20 +428,10 @@ def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class SimulatedShot:
-    """A streak image and the truth behind it.
-
-    Parameters
-    ----------
-    streak : Streak
-        Measurements in photons with noise, background and saturation; carries the true camera.
-    camera : Camera
-        The true camera, with the gains and the sweep that made the picture.
-    truth : GroundTruth
-        What the reference view sees.
-    signal : (rows, columns) float32 array
-        Expected signal of each streak pixel without background, photons.
-    exposure : float
-        Photons for reflectance 1 at 1 m that fills a picture pixel, in a view of gain 1.
+    """A `streak` image in photons, with noise, background and saturation, and the truth behind it: the
+    `camera` with the gains and the sweep that made it; the `truth` of the reference view; `signal`
+    (rows, columns), expected photons of each streak pixel without background; and `exposure`, photons
+    for reflectance 1 at 1 m that fills a picture pixel, in a view of gain 1.
     """
 
     streak: Streak

@@ -181,25 +181,15 @@ def iterate(
 
 @dataclass(frozen=True)
 class Result:
-    """Recovered pictures and how they came about.
+    """Recovered pictures, `frames` (frames, rows, columns), where the measurements were, and how they
+    came about.
 
-    Parameters
-    ----------
-    frames : (frames, rows, columns) array
-        Where the measurements were.
-    iterations : int
-        Of the block that took most; 0 for direct methods.
-    objective : (iterations + 1,) array
-        Sum over all frames; blocks that stopped early count with their last value. Empty for direct
-        methods.
-    stop_reason : str
-        ``"converged"``, ``"iterations done"`` or ``"direct method"``.
-    setup_seconds : float
-        Time spent on what depends on the operator only and on loading compiled loops, not on the
-        measurements.
-    duality_gap : float
-        The last objective is above the least one by at most this fraction of it; NaN where that is
-        not known.
+    `iterations` are those of the block that took most, 0 for direct methods; `objective` (iterations
+    + 1,) is the sum over all frames, in which blocks that stopped early count with their last value,
+    empty for direct methods; `stop_reason` is ``"converged"``, ``"iterations done"`` or ``"direct
+    method"``; `setup_seconds` were spent on what depends on the operator only and on loading compiled
+    loops. The last objective is above the least one by at most the fraction `duality_gap` of it; NaN
+    where that is not known.
     """
 
     frames: Array

@@ -112,16 +112,9 @@ def count_live_cycles(
 
 @dataclass(frozen=True)
 class Arrivals:
-    """Returns of histograms, the strongest first; NaN where there are fewer.
-
-    Parameters
-    ----------
-    range : (n, returns) array
-        Distance for a co-located source, m; the middle of the first bin is range 0.
-    photons : (n, returns) array
-        Photons of the return.
-    confidence : (n, returns) array
-        Expected standard deviation of the range, m: the Cramer-Rao bound at the estimate.
+    """Returns of histograms, (n, returns), the strongest first; NaN where there are fewer: `range` for a
+    co-located source, m, the middle of the first bin being range 0; its `photons`; and `confidence`,
+    the range's expected standard deviation, m, the Cramer-Rao bound at the estimate.
     """
 
     range: FloatArray

@@ -462,28 +462,14 @@ def leave_out_pixels(photons: PhotonImage, pixels: BoolArray) -> PhotonImage:
 
 @dataclass(frozen=True)
 class SurfaceImage:
-    """A range for every pixel.
+    """A range for every pixel, (rows, columns), NaN where there is none: `range` for a co-located source,
+    m, the middle of the first bin being range 0; `range_sigma`, its standard deviation, m;
+    `intensity`, expected photons of the return; `outlier_probability`, that the return is not of this
+    pixel's surface, or that it has none: where nothing sends light back the neighbours' surface goes on.
 
-    Parameters
-    ----------
-    range : (rows, columns) float64 array
-        Distance for a co-located source, m; the middle of the first bin is range 0. NaN where there
-        is none.
-    range_sigma : (rows, columns) float64 array
-        One standard deviation of the range, m.
-    intensity : (rows, columns) float64 array
-        Expected photons of the return.
-    outlier_probability : (rows, columns) float64 array
-        That the return is not of this pixel's surface, or that it has none: where nothing sends light
-        back the neighbours' surface goes on.
-    pulse : Pulse
-        The response that was used, as bins show it.
-    settings : mapping
-        What was chosen from the data, by name.
-    further : tuple of SurfaceImage
-        Weaker returns of the same pixels, the strongest first; NaN where there is none.
-    hot_pixels : (rows, columns) bool array, optional
-        Pixels whose photons were left out; see `find_hot_pixels`.
+    `pulse` is the response that was used, as bins show it; `settings` what was chosen from the data,
+    by name; `further` weaker returns of the same pixels, the strongest first; `hot_pixels` (rows,
+    columns) those whose photons were left out, see `find_hot_pixels`.
     """
 
     range: FloatArray

@@ -74,22 +74,11 @@ def compute_range_bound(pulse: Pulse, bin_width: float, photons: float, backgrou
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How the detector fared.
-
-    Parameters
-    ----------
-    rms_m : float
-        Root mean square range error of the detected returns, wrongly placed ones included, m; NaN
-        without any.
-    bound_m : float
-        Cramer-Rao bound of the range, m.
-    ratio : float
-        The first over the second. Near 1 where the bound holds; more when noise is mistaken for the
-        return.
-    detection_rate : float
-        Share of the histograms with a return in which one was found.
-    false_alarm_rate : float
-        Share of the histograms without a return in which one was found.
+    """How the detector fared: `rms_m`, root mean square range error of the detected returns, wrongly
+    placed ones included, m, NaN without any; `bound_m`, the Cramer-Rao bound of the range, m; their
+    `ratio`, near 1 where the bound holds, more when noise is mistaken for the return;
+    `detection_rate` and `false_alarm_rate`, shares of the histograms with and without a return in
+    which one was found.
     """
 
     rms_m: float
