@@ -84,14 +84,9 @@ class SkewSweep(Sweep):
 class PolynomialSweep(Sweep):
     """A bivariate quadratic map, as MATLAB's ``fitgeotrans(..., 'polynomial', 2)`` makes it.
 
-    ``u = c . [1, x, y, x*y, x^2, y^2]`` in normalised 0-based coordinates, x = column, y = row,
-    alike for v = raw row.
-
-    Parameters
-    ----------
-    column_coefficients, row_coefficients : (6,) array
-    rectified_origin, rectified_scale, raw_origin, raw_scale : (2,) array
-        (x, y) normalisation: ``normalised = (pixel - origin) / scale``.
+    ``u = c . [1, x, y, x*y, x^2, y^2]`` in normalised 0-based coordinates, x = column, y = row, with the
+    `column_coefficients` (6,), alike for v = raw row with the `row_coefficients`; `rectified_origin`,
+    `rectified_scale`, `raw_origin` and `raw_scale` (2,) normalise (x, y) by ``(pixel - origin) / scale``.
     """
 
     RECORD_KIND = "polynomial_sweep"
@@ -484,27 +479,11 @@ DIRECTION_TOLERANCE = 1e-10  # in units of the focal length; far below a thousan
 
 
 def compute_ray_directions(camera: Camera, rows: ArrayLike, columns: ArrayLike) -> FloatArray:
-    """Direction in which each pixel of the reference view looks.
+    """Return the direction in which each pixel of the reference view looks, at `rows` and `columns` (n,), not
+    necessarily whole numbers: unit vectors (n, 3), x right, y down, z forward.
 
-    A pinhole ``((column - column_0) / f, (row - row_0) / f, 1)``, normalised, with the camera's
-    lens distortion undone.
-
-    Parameters
-    ----------
-    camera : Camera
-        Gives the focal length f, the optical axis and the distortion.
-    rows, columns : (n,) array
-        Pixel positions, not necessarily whole numbers.
-
-    Returns
-    -------
-    (n, 3) array
-        Unit vectors; x right, y down, z forward.
-
-    Raises
-    ------
-    CalibrationError
-        A distortion so strong that no direction leads to a pixel.
+    A pinhole ``((column - column_0) / f, (row - row_0) / f, 1)``, normalised, with the lens distortion of
+    `camera` undone; `CalibrationError` where that is so strong that no direction leads to a pixel.
     """
     right, down = compute_slopes(camera, rows, columns)
     forward = 1 / np.sqrt(right * right + down * down + 1)

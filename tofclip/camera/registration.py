@@ -46,21 +46,12 @@ class SkewEstimate:
 
 
 def estimate_skew(counts: Float32Array, camera: Camera) -> SkewEstimate:
-    """Match each view's energy curve to the reference view's by ``row_k = offset_k + (1 +
-    stretch_k) * row``.
+    """Match each view's energy curve in the raw `counts` (rows, columns) to the reference view's by
+    ``row_k = offset_k + (1 + stretch_k) * row``.
 
-    Parameters
-    ----------
-    counts : (rows, columns) array
-        Raw streak image.
-    camera : Camera
-        Its centres say where the views are; the view whose position is nearest 0 is the reference.
-
-    Raises
-    ------
-    CalibrationError
-        A view's curve does not resemble the reference's, or the picture is not as wide as the
-        camera's slit.
+    The centres of `camera` say where the views are; the view whose position is nearest 0 is the
+    reference. `CalibrationError` where a view's curve does not resemble the reference's, or the picture
+    is not as wide as the camera's slit.
     """
     curves = _extract_structure(sum_view_energies(counts, camera))
     reference = int(np.argmin(np.abs(camera.view_positions)))
@@ -471,22 +462,9 @@ def find_sharpest_shears(
     explains them all. In the depth-of-field arrangement, where little defocuses, that tells more
     than the pictures' sharpness.
 
-    Parameters
-    ----------
-    measurement : Measurement
-        Rectified measurements.
-    camera : Camera
-    gates : sequence of slice
-        Frames of each gate.
-    shears : (n,) array
-        Evenly spaced, pixels per view step.
-    progress : callable
-        Called with the number of frame iterations just done.
-
-    Raises
-    ------
-    InputError
-        There are fewer than two finite shears.
+    The `measurement` of `camera` is rectified; `gates` are the frames of each, `shears` (n,) evenly
+    spaced, pixels per view step, and `progress` is called with the number of frame iterations just
+    done. `InputError` for fewer than two finite shears.
     """
     tried = np.asarray(shears, dtype=np.float64)
     require(

@@ -319,15 +319,10 @@ def complete_cloud(xyz: FloatArray, known: Mapping[str, AnyArray]) -> PointCloud
 
 
 def point_cloud(returns: Returns) -> PointCloud:
-    """Place every return in space: its range along the direction in which its pixel looks.
+    """Place each of the `returns` in space: its range along the direction in which its pixel looks.
 
     Heights that parallax displaced, because the picture was recovered at another shear than that of
     its range, are put right where the camera knows its lenslet pitch.
-
-    Parameters
-    ----------
-    returns : Returns
-        Radial distances with their camera.
     """
     require_type(returns, Returns, "a point cloud is made of Returns, see tofclip.depth")
     right, down = compute_slopes(returns.camera, *returns.line_of_sight_px)

@@ -379,28 +379,14 @@ def estimate_depth_from_focus(
     window_px: float = WINDOW_PX,
     smoothness: float = SMOOTHNESS,
 ) -> IntArray:
-    """Return for each pixel the number of the picture of the stack in which it is sharp, (rows,
+    """Return for each pixel the number of the picture of the `stack` in which it is sharp, (rows,
     columns).
 
-    Sharpness is averaged over a Gaussian window, which keeps noise from winning; labels are then
-    chosen so that neighbours differ little, which lets pixels without texture follow those that
-    have some.
-
-    Parameters
-    ----------
-    stack : FocalStack
-    measure : callable
-        `compute_modified_laplacian` or `compute_image_energy`, or another one.
-    window_px : float
-        Standard deviation of the window.
-    smoothness : float
-        Price of two neighbours being one picture apart, relative to a textured pixel being out of
-        focus.
-
-    Raises
-    ------
-    InputError
-        The pictures have no texture.
+    Sharpness, by a `measure` such as `compute_modified_laplacian`, is averaged over a Gaussian window of
+    standard deviation `window_px`, which keeps noise from winning; labels are then chosen so that
+    neighbours differ little, which lets pixels without texture follow those that have some.
+    `smoothness` is the price of two neighbours being one picture apart, relative to a textured pixel
+    being out of focus. `InputError` where the pictures have no texture.
     """
     from scipy.ndimage import gaussian_filter
 

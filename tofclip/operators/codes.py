@@ -71,18 +71,9 @@ class DenseSensor(Reshape):
 
 class PitchedSensor(Selection):
     """Small pixels far apart: every n-th pixel of the plane is read (supplement Note 3, sparse 2D
-    sensors).
-
-    Parameters
-    ----------
-    plane_shape : (int, int)
-    pitch_px : (float, float)
-        Distance from row to row and from column to column, at least 1. A pitch that is not a whole
-        number reads the pixels nearest below the true places.
-    offset_px : (float, float)
-        First row and column that are read.
-    dtype : dtype
-        float32 or float64.
+    sensors), of a picture of `plane_shape`, in `dtype` float32 or float64. `pitch_px` is the distance
+    from row to row and from column to column, at least 1; where it is not a whole number, the pixels
+    nearest below the true places are read. `offset_px`: first row and column that are read.
     """
 
     def __init__(
@@ -114,23 +105,14 @@ class PitchedSensor(Selection):
 
 class HadamardCodes(LinearOperator):
     """Random 0/1 codes with a fast product: rows of a Hadamard matrix whose columns have random
-    signs.
+    signs, so many `codes` of pictures of `image_shape`, in `dtype` float32 or float64; the signs and the
+    rows are those of a `seed`.
 
     A code is ``(1 + H D) / 2``: D holds a random sign for each pixel, and the rows of H are drawn
     without replacement (structurally random matrices, T. T. Do et al., IEEE Trans. Signal Process.
     60, 139 (2012)). H is the Kronecker product of one Hadamard matrix for each side, the picture
     padded to powers of two, so that all of it is a fast Walsh-Hadamard transform along either side
     of the picture.
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-    codes : int
-        Number of measurements.
-    seed : int
-        Of the signs and the rows.
-    dtype : dtype
-        float32 or float64.
     """
 
     def __init__(

@@ -125,17 +125,12 @@ def _multiply_gathered(columns: Array, values: Array, block: Array) -> Array:
 
 
 class SparseMatrix(LinearOperator):
-    """A CSR matrix and its transpose, applied to blocks of frames.
+    """A CSR `matrix`, float32 or float64, and its transpose, applied to blocks of frames: from `shape_in`,
+    of as many elements as it has columns, to `shape_out`, of as many as it has rows.
 
     Matrix and transpose are set up on first use, for each library and device whose arrays come in,
     so that forward and adjoint are one gathering product on blocks. Memory is 8 bytes per nonzero
     and side in float32, in each place. A lone NumPy picture goes through scipy's own product.
-
-    Parameters
-    ----------
-    matrix : scipy sparse matrix or array, (rows, columns)
-        float32 or float64, with as many columns as `shape_in` has elements and rows as `shape_out`.
-    shape_in, shape_out : tuple of int
     """
 
     portable = True

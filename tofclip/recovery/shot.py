@@ -396,24 +396,11 @@ def fit_parallax_to_shot(
 ) -> ShotParallax:
     """Fit lenslet pitch and focus distance to the shears at which a shot's gates are in focus.
 
-    Parameters
-    ----------
-    shot : Shot
-        Of a scene at several ranges, with a true time zero. A sweep that is not known is estimated
-        from the shot.
-    gates : int
-        Number of gates, of equal brightness.
-    shears : (float, float, int)
-        First and last shear tried and their number, pixels per view step.
-    progress : callable
-        Called with the number of frame iterations just done.
-
-    Raises
-    ------
-    CalibrationError
-        Fewer than two gates have their best shear within those tried.
-    InputError
-        Fewer than three gates.
+    The `shot` is of a scene at several ranges, with a true time zero; a sweep that is not known is
+    estimated from it. There are so many `gates`, of equal brightness; `shears` are the first and the last
+    tried and their number, pixels per view step; `progress` is called with the number of frame
+    iterations just done. `InputError` for fewer than three gates, `CalibrationError` where fewer than
+    two have their best shear within those tried.
     """
     require(gates >= MIN_GATES, f"a parallax needs {MIN_GATES} gates or more, got {gates}")
     shot = shot.fit_camera(progress)

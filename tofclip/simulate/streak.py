@@ -442,19 +442,8 @@ class SimulatedShot:
 
 
 def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedShot:
-    """Take one shot of `scene`.
-
-    Parameters
-    ----------
-    scene : Scene
-    instrument : Instrument
-    seed : int
-        Of the photon noise; the same seed gives the same shot.
-
-    Raises
-    ------
-    InputError
-        No light of the scene reaches the streak image.
+    """Take one shot of `scene` by an `instrument`; the same `seed`, of the photon noise, gives the same shot.
+    `InputError` where no light of the scene reaches the streak image.
     """
     camera, detector = instrument.camera, instrument.detector
     # In relative units: the exposure below decides what a unit is in photons.

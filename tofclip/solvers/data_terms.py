@@ -22,17 +22,11 @@ def sum_squares(values: Array) -> Array:
 
 
 class DataTerm(ABC):
-    """A smooth function of the predicted measurements whose gradient has Lipschitz constant 1,
-    frame by frame.
+    """A smooth function of the predicted `measurements` (measurements, frames) whose gradient has
+    Lipschitz constant 1, frame by frame; `valid` is False where one is saturated or dead, and left out.
 
     Every one has a gradient of the form ``weights * (predicted - measurements)``, so that a solver
     of quadratic problems can treat it by iteratively reweighted least squares.
-
-    Parameters
-    ----------
-    measurements : (measurements, frames) array
-    valid : (measurements, frames) bool array, optional
-        False where a measurement is saturated or dead: it is left out.
     """
 
     def __init__(self, measurements: Array, valid: Mask = None) -> None:
@@ -147,17 +141,10 @@ class Poisson(DataTerm):
     """The negative log-likelihood of photon counts, each residual in units of its own measurement's
     noise.
 
-    Predicted and counted are both divided by a `deviation` of at least ``sqrt(count + 1)``
-    beforehand (weigh the operator's rows alike), so that no measurement's curvature at its own
+    Predicted and counted are both divided by a `deviation` (measurements,) of at least ``sqrt(count +
+    1)`` beforehand (weigh the operator's rows alike), so that no measurement's curvature at its own
     count is above 1. Below half the deviation's square the logarithm is continued by its parabola,
     whose gradient stays Lipschitz; the whole is divided by the largest curvature.
-
-    Parameters
-    ----------
-    measurements : (measurements, frames) array
-        Counts over `deviation`.
-    valid : (measurements, frames) bool array, optional
-    deviation : (measurements,) array
     """
 
     CURVATURE = 4.0  # at the knee, where it is largest
