@@ -28,34 +28,17 @@ if TYPE_CHECKING:
 
 
 class PointSpreadConvolution(LinearOperator):
-    """A picture convolved with a point-spread function (PSF), on the plane of the sensor
-    (supplement Eq. 4).
+    """A picture of `image_shape` convolved with a point-spread function (PSF), on the plane of the sensor
+    (supplement Eq. 4), in `dtype` float32 or float64.
 
-    A point in the picture's middle puts the PSF, as it is, about the sensor's middle. The
-    convolution is linear: the picture is dark beyond its border, and light that falls beside the
-    sensor is lost. It runs over Fourier space, padded by just as much as keeps periodic images of
-    the picture off the sensor.
+    `point_spread` (rows, columns) is the light on the sensor from a point of brightness 1, its origin pixel
+    ``(rows // 2, columns // 2)``: a point in the picture's middle puts it, as it is, about the sensor's
+    middle. `sensor_shape` is the picture's by default; a lensless camera sees more than its sensor covers:
+    then the picture is the larger. The convolution is linear: the picture is dark beyond its border, and
+    light that falls beside the sensor is lost. It runs over Fourier space, padded by just as much as keeps
+    periodic images of the picture off the sensor. `ShapeError` or `InputError` where the PSF is larger than
+    the picture, dark everywhere, or holds NaN or infinity.
 
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns of the picture.
-    point_spread : (rows, columns) array
-        Light on the sensor from a point of brightness 1; its origin is pixel
-        ``(rows // 2, columns // 2)``.
-    sensor_shape : (int, int), optional
-        Rows and columns of the sensor, about the picture's middle; the default is the picture's
-        shape. A lensless camera sees more than its sensor covers: then the picture is the larger.
-    dtype : dtype
-        float32 or float64.
-
-    Raises
-    ------
-    ShapeError, InputError
-        The PSF is larger than the picture, dark everywhere, or holds NaN or infinity.
-
-    Notes
-    -----
     ``scipy.fft`` is used: 0.18 ms for both transforms of a 128 x 128 picture padded to 192 x 192. A
     pyFFTW plan takes 0.16 ms unmeasured and 0.12 ms measured, but owns its memory, so that threads
     would have to wait for each other.
@@ -142,31 +125,19 @@ def alias_free_length(image: int, sensor: int, spread: int, first: int, centre: 
 
 
 class SliceConvolution(LinearOperator):
-    """The middle row of a picture's convolution with each of several PSFs: what 1D sensors read
-    (Eq. 8).
+    """The middle row of the convolution of a picture, of `image_shape`, with each of several PSFs: what 1D
+    sensors read (Eq. 8), (lines * sensor_px,), PSF by PSF, in `dtype` float32 or float64.
+
+    `point_spreads` (lines, rows, columns) are the light on the sensor's plane from a point in the middle,
+    the origin being pixel ``(rows // 2, columns // 2)``; the sensors, of `sensor_px` pixels about the
+    picture's middle, as many as its columns by default, lie at row ``(rows - 1) // 2``, from where a PSF as
+    high as the picture reaches all rows.
 
     Along the sensor's direction the convolution is a product in Fourier space; across it, each of
     the picture's rows is weighed by its own row of the PSF and all are summed. So at every
     frequency k the measurements are a small matrix times the picture's column of the spectrum,
     ``L[k] = G_k P_k`` (supplement Eq. 15 and 16). Its cost and memory, 8 bytes for each PSF, row
     and frequency, do not depend on how large or how sparse the PSFs are.
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns of the picture. The sensors lie at row ``(rows - 1) // 2``, from where a
-        PSF as high as the picture reaches all rows.
-    point_spreads : (lines, rows, columns) array
-        Light on the sensor's plane from a point in the middle; the origin is pixel ``(rows // 2,
-        columns // 2)``.
-    sensor_px : int, optional
-        Pixels of each sensor, about the picture's middle; the default is the picture's columns.
-    dtype : dtype
-        float32 or float64.
-
-    Notes
-    -----
-    Measurements are (lines * sensor_px,), PSF by PSF.
     """
 
     def __init__(

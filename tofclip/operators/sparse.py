@@ -188,29 +188,17 @@ def _apply(products: PerDevice[Product], block: Array, target: Shape) -> Array:
 
 
 class LineProjection(SparseMatrix):
-    """All views' line projections onto one slit, as a single sparse matrix on native slit pixels.
+    """All views' line projections onto one slit, as a single sparse matrix on native slit pixels, in `dtype`
+    float32 or float64.
 
-    Pixel (row, column) of the picture, at ``X = column - columns // 2`` and ``Y = row - rows // 2``
-    from the optical axis, falls on slit position ``centre_k + X - Y * tan(angle_k)`` of view k and
-    is shared between the two nearest slit pixels by linear interpolation. Views may overlap on the
-    slit: their light adds up, as it does in the instrument. Refocusing moves the centres
-    (`Camera.operator`), because a line integral turns a 2D shift into a 1D one (supplement Eq. 21:
-    A_k B_k is A_k with an offset detector).
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns of the picture.
-    slit_width_px : int
-        Slit pixels; what falls beyond them is lost.
-    centres_px : (views,) array
-        Slit position of each view's optical axis; real numbers.
-    angles : (views,) array
-        Angles of the line responses from the vertical, rad.
-    gains : (views,) array
-        Brightness of each view.
-    dtype : dtype
-        float32 or float64.
+    Pixel (row, column) of the picture, of `image_shape`, at ``X = column - columns // 2`` and ``Y = row -
+    rows // 2`` from the optical axis, falls on slit position ``centre_k + X - Y * tan(angle_k)`` of view
+    k and is shared between the two nearest of the `slit_width_px` slit pixels by linear interpolation;
+    what falls beyond them is lost. `centres_px` (views,) are the real positions of each view's optical
+    axis, `angles` (views,) those of the line responses from the vertical, rad, `gains` (views,) the
+    brightness of each view. Views may overlap on the slit: their light adds up, as it does in the
+    instrument. Refocusing moves the centres (`Camera.operator`), because a line integral turns a 2D shift
+    into a 1D one (supplement Eq. 21: A_k B_k is A_k with an offset detector).
     """
 
     def __init__(
@@ -262,31 +250,16 @@ FRACTION_BITS = 32
 
 
 class RadonProjection(SparseMatrix):
-    """Line projections in Radon coordinates (supplement Note 6).
+    """Line projections in Radon coordinates (supplement Note 6): (angles * detector_px,) measurements, angle by
+    angle, in `dtype` float32 or float64. A lone picture is projected without a matrix.
 
-    Pixel (row, column), at ``X = column - columns // 2`` and ``Y = row - rows // 2``, falls on
-    position ``detector_px // 2 + X cos(angle) + Y sin(angle) + offset`` of the angle's detector and
-    is shared between the two nearest detector pixels. An offset of ``s (du cos(angle) + dv
-    sin(angle))`` makes it A_k B_k for the view (dv, du) from the reference, because a line integral
-    turns a 2D shift into a 1D one (Eq. 21).
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-        Rows and columns of the picture.
-    detector_px : int
-        Pixels of each line detector; what falls beyond them is lost.
-    angles : (angles,) array
-        Direction along which the detector extends, rad from the x axis towards y (down).
-    offsets_px : (angles,) array
-        Shift of the picture along each detector.
-    dtype : dtype
-        float32 or float64.
-
-    Notes
-    -----
-    Measurements are (angles * detector_px,), angle by angle. A lone picture is projected without a
-    matrix.
+    Pixel (row, column) of a picture of `image_shape`, at ``X = column - columns // 2`` and ``Y = row - rows
+    // 2``, falls on position ``detector_px // 2 + X cos(angle) + Y sin(angle) + offset`` of the angle's
+    detector and is shared between the two nearest of its `detector_px` pixels; what falls beyond them is
+    lost. `angles` (angles,) say along which direction each detector extends, rad from the x axis towards y
+    (down), `offsets_px` (angles,) by how much the picture is shifted along it. An offset of ``s (du
+    cos(angle) + dv sin(angle))`` makes it A_k B_k for the view (dv, du) from the reference, because a line
+    integral turns a 2D shift into a 1D one (Eq. 21).
     """
 
     def __init__(

@@ -415,21 +415,11 @@ class RangingPlan(Storable):
 
 @dataclass(frozen=True)
 class RangingSettings:
-    """How the shots of a sequence become clouds.
-
-    Parameters
-    ----------
-    camera : Path, optional
-        By default the one inside the first shot. A sweep that it does not know is found from that
-        shot.
-    time_zero : float, optional
-        Reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
-    focus : str
-        ``depth-locked`` or ``fixed:S``.
-    average : int
-        Shots averaged for each cloud.
-    steady : bool
-        Whether to find how late each shot comes against the first one, and take it off.
+    """How the shots of a sequence become clouds: by `camera`, the one inside the first shot by default, from
+    which a sweep that it does not know is found; `time_zero`, reading of the time axis at which light of
+    range 0 would arrive, s, the camera's by default; `focus`, ``depth-locked`` or ``fixed:S``; so many
+    shots averaged for each (`average`); and whether it is found how late each shot comes against the first
+    one, and taken off (`steady`).
     """
 
     camera: Path | None = None

@@ -147,20 +147,9 @@ class Scene:
 
 @dataclass(frozen=True)
 class StreakDetector:
-    """The streak tube's screen, read out in photons.
-
-    Parameters
-    ----------
-    rows : int
-        Rows of the streak image.
-    bin_width : float
-        Duration of a row, s.
-    peak_photons : float
-        Expected signal of the brightest streak pixel; sets the exposure.
-    background_photons : float
-        Expected background of every streak pixel.
-    full_scale_photons : float
-        Reading at which a pixel saturates.
+    """The streak tube's screen, read out in photons: so many `rows` of `bin_width`, s. `peak_photons` are the
+    expected signal of the brightest streak pixel, and set the exposure; `background_photons` come to
+    every pixel; at `full_scale_photons` one saturates.
     """
 
     rows: int = 576
@@ -198,16 +187,8 @@ class StreakDetector:
 
 @dataclass(frozen=True)
 class Instrument:
-    """A camera with what only a simulation has to know of it.
-
-    Parameters
-    ----------
-    camera : Camera
-        Geometry, gains, sweep, pulse, time zero, lenslet pitch and focus distance. View k stands at
-        ``x = lenslet_pitch * view_positions[k]``.
-    detector : StreakDetector
-    rays_per_pixel_side : int
-        A picture pixel is sampled by the square of this number of rays.
+    """A `camera` and its `detector`; view k stands at ``x = lenslet_pitch * view_positions[k]``. A picture
+    pixel is sampled by the square of `rays_per_pixel_side` rays.
     """
 
     camera: Camera

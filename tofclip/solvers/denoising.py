@@ -108,24 +108,13 @@ PEAK_QUANTILE = 0.999
 class PlugAndPlay(Method):
     """Half-quadratic splitting with a denoiser in the place of the prior's proximal map.
 
-    ``x = argmin data(A h) + coupling / 2 |h - z|^2``, then ``z = denoise(x)``, a few times, from a
-    variational method's result onwards; z is returned. S. Venkatakrishnan, C. Bouman, B. Wohlberg,
-    GlobalSIP 2013, 945. No objective falls: the number of calls is what stops it. The
-    defaults were found on light fields whose model error (what is out of focus) is far larger than
-    their noise; on those, `strength` from 0.08 to 0.12 and `coupling` from 0.1 to 0.3 differ by a
-    tenth of the error.
-
-    Parameters
-    ----------
-    start : ProximalMethod
-        Gives the first picture, and with it the data term; total variation by default.
-    denoiser : Denoiser
-    calls : int
-        Of the denoiser.
-    strength : float
-        Deviation that the denoiser removes, relative to the start's brightest pixel.
-    coupling : float
-        Relative to the largest eigenvalue of A'A.
+    ``x = argmin data(A h) + coupling / 2 |h - z|^2``, then ``z = denoise(x)``, a number of `calls` of the
+    `denoiser`, from the result of `start` onwards, which gives the data term and is total variation by
+    default; z is returned. S. Venkatakrishnan, C. Bouman, B. Wohlberg, GlobalSIP 2013, 945. No objective
+    falls: the number of calls is what stops it. `strength` is the deviation that is removed, relative to
+    the start's brightest pixel, `coupling` relative to the largest eigenvalue of A'A: the defaults were
+    found on light fields whose model error (what is out of focus) is far larger than their noise; on
+    those, strengths from 0.08 to 0.12 and couplings from 0.1 to 0.3 differ by a tenth of the error.
     """
 
     start: ProximalMethod = field(default_factory=TotalVariation)

@@ -49,17 +49,13 @@ ROWS_AT_ONCE = 192
 
 @dataclass(frozen=True)
 class LinearInverse(Method):
-    """The regularised linear inverse ``h = A' (A A' + mu I)^-1 f``.
+    """The regularised linear inverse ``h = A' (A A' + mu I)^-1 f``, mu being `damping` times the largest
+    eigenvalue of A A'.
 
     The small Gram matrix is inverted once (Cholesky, float64); a block then costs one dense product
     of that size and one sparse one. For many shots with one camera, hold on to what `prepare`
     returns. Measurements that are bad in every frame are left out: a linear map cannot leave out a
     measurement of one frame only.
-
-    Parameters
-    ----------
-    damping : float
-        mu relative to the largest eigenvalue of A A'.
     """
 
     damping: float = 1e-2

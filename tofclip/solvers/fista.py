@@ -72,25 +72,10 @@ class Fista:
     the momentum follows their ratio (L. Calatroni, A. Chambolle, SIAM J. Optim. 29, 1772 (2019)).
     Two thirds of the iterations lead as far.
 
-    Parameters
-    ----------
-    operator : LinearOperator
-        A.
-    data_term : DataTerm
-    regulariser : Regulariser
-    step_size : float
-        The safe one, at most 1 over the largest eigenvalue of A'A.
-    frames : int
-        Number of frames of the block.
-
-    Attributes
-    ----------
-    current : (rows, columns, frames) array
-        With a light field's model (views, rows, columns, frames).
-        The solution so far.
-    objective : (frames,) array
-    rejected : (frames,) bool array
-        Frames whose last step was refused.
+    `operator` is A, `step_size` the safe one, at most 1 over the largest eigenvalue of A'A, `frames` the
+    number of frames of the block. `current` (rows, columns, frames), with a light field's model (views,
+    rows, columns, frames), is the solution so far; `objective` and `rejected` (frames,) say how good it is
+    and which frames' last step was refused.
     """
 
     def __init__(

@@ -20,32 +20,13 @@ BINS_PER_BATCH = 1 << 22  # of histograms that are held at a time: 32 MiB
 
 
 def compute_range_bound(pulse: Pulse, bin_width: float, photons: float, background: float) -> float:
-    """Least standard deviation of the range that an unbiased estimate can have (Cramer-Rao).
+    """Return the least standard deviation of the range, m, that an unbiased estimate can have (Cramer-Rao), of
+    a return of the shape `pulse` in bins of `bin_width`, s, of which so many `photons` are expected, and
+    so many of the `background` in a bin: the bound of the time of flight times half the speed of light.
 
     Photons are Poisson distributed; arrival and number of photons are unknown, the background is
-    known. The variance is averaged over where in a bin the pulse arrives.
-
-    Parameters
-    ----------
-    pulse : Pulse
-        Shape of a return.
-    bin_width : float
-        Duration of a bin, s.
-    photons : float
-        Expected photons of the return.
-    background : float
-        Expected background photons in a bin.
-
-    Returns
-    -------
-    float
-        Metres: the bound of the time of flight times half the speed of light.
-
-    Raises
-    ------
-    InputError
-        A bin width or number of photons that is not positive, a negative background, or more than
-        `MAX_PHOTONS` of either.
+    known. The variance is averaged over where in a bin the pulse arrives. `InputError` for a bin width or
+    number of photons that is not positive, a negative background, or more than `MAX_PHOTONS` of either.
     """
     if not (bin_width > 0 and 0 < photons <= MAX_PHOTONS and 0 <= background <= MAX_PHOTONS):
         raise InputError(
@@ -96,26 +77,11 @@ def measure_accuracy(
     seed: int = 0,
     progress: Callable[[int], None] = lambda _: None,
 ) -> Accuracy:
-    """Simulate histograms with and without a return, and locate it.
-
-    Parameters
-    ----------
-    detector : PhotonDetector
-    photons : float
-        Expected photons of the return, which arrives anywhere in the middle half of the histogram.
-    background : float
-        Expected background photons in a bin; the detector does not know it.
-    trials : int
-        Histograms with a return, and as many without.
-    seed : int
-        Of the photons' chance and of the detector's, independent of each other.
-    progress : callable
-        Called with the number of trials just done.
-
-    Raises
-    ------
-    InputError
-        No trial, or a number of photons that is not positive.
+    """Simulate as many histograms with and without a return as `trials` and locate it by the `detector`:
+    `photons` are expected of the return, which arrives anywhere in the middle half of the histogram, and
+    of a `background` that the detector does not know so many in a bin. The photons' chance and the
+    detector's are independent, both of the `seed`; `progress` is called with the number of trials just
+    done. `InputError` for no trial, or a number of photons that is not positive.
     """
     if trials < 1:
         raise InputError(f"at least one trial is needed, got {trials}")
