@@ -273,7 +273,7 @@ def test_accuracy_reports_what_was_asked(detector, monkeypatch):
     assert below.detection_rate < 0.5
     assert below.ratio > 3  # what is detected there is mostly noise
     # In batches memory does not grow with the number of trials, and every trial counts.
-    monkeypatch.setattr("tofclip.lidar.photons.limits.BINS_PER_BATCH", 128 * BINS)
+    monkeypatch.setattr("tofclip.lidar.photons.detector.BINS_PER_BATCH", 128 * BINS)
     done: list[int] = []
     pieces = measure_accuracy(detector, 100, 0.1, trials=500, seed=3, progress=done.append)
     assert done == [128, 128, 128, 116]

@@ -19,8 +19,13 @@ from tofclip.camera.rectifier import Measurement
 from tofclip.operators import LineProjection
 from tofclip.storage import Scalar
 
-FLOOR_FIGURE, GAIN_FIGURE = "noise_floor_count", "noise_gain_count"
-MISFIT_FIGURE, DAZZLE_FIGURE = "noise_misfit_fraction", "noise_dazzle_count"
+# by which frames know the fields of `MeasurementNoise`
+FIGURES = {
+    "noise_floor_count": "floor",
+    "noise_gain_count": "gain",
+    "noise_misfit_fraction": "misfit",
+    "noise_dazzle_count": "dazzle",
+}
 # Columns beside light above `MeasurementNoise.dazzle` that it dazzles: the model's error and the slit's
 # blur.
 DAZZLE_REACH_COLUMNS = 2
@@ -52,23 +57,13 @@ class MeasurementNoise:
     @classmethod
     def from_figures(cls, known: Mapping[str, Scalar]) -> MeasurementNoise | None:
         """Return what a recovery wrote down of its measurements; None if it did not."""
-        if FLOOR_FIGURE not in known or GAIN_FIGURE not in known:
-            return None
-        return cls(
-            float(known[FLOOR_FIGURE]),
-            float(known[GAIN_FIGURE]),
-            float(known.get(MISFIT_FIGURE, 0.0)),
-            float(known.get(DAZZLE_FIGURE, np.inf)),
-        )
+        found = {field: float(known[name]) for name, field in FIGURES.items() if name in known}
+        return cls(**found) if {"floor", "gain"} <= set(found) else None
 
     def list_figures(self) -> dict[str, Scalar]:
         """List what frames have to know of their measurements."""
-        figures: dict[str, Scalar] = {
-            FLOOR_FIGURE: self.floor,
-            GAIN_FIGURE: self.gain,
-            MISFIT_FIGURE: self.misfit,
-        }
-        return figures | ({DAZZLE_FIGURE: self.dazzle} if np.isfinite(self.dazzle) else {})
+        found = {name: getattr(self, field) for name, field in FIGURES.items()}
+        return {name: value for name, value in found.items() if np.isfinite(value)}
 
     def compute_variance(self, light: Float32Array) -> Float32Array:
         """Return each measurement's variance, (columns, frames), of so much predicted light."""

@@ -22,9 +22,6 @@ from tofclip.lidar.range_calibration import correct_ranges
 from tofclip.shots import Returns
 from tofclip.units import SPEED_OF_LIGHT, require_credible_bin_width
 
-# Of the cycles that no photon has ended yet: what fewer show is not worth its noise, and of more
-# photons their number is not known.
-MIN_READY_SHARE, MAX_BLIND_SHARE = 0.02, 0.9
 MIN_BIN_WIDTH_S = 1e-13  # half of the finest channel of time-correlated counters (0.2 ps)
 
 
