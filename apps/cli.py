@@ -23,15 +23,16 @@ import traceback
 import warnings
 from _thread import interrupt_main
 from collections.abc import Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
+from apps.options import take_json
 from apps.progress import silence
-from apps.report import name_options, replace_results
+from apps.report import REPLACES, holding, name_options
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import DISK_IS_FULL, describe_missing_package
 from tofclip.version import __version__
@@ -173,6 +174,7 @@ class VerbGroup(TyperGroup):
         return [item for item in super().shell_complete(ctx, incomplete) if " " not in item.value]
 
 
+@cache
 def load_verb(name: str) -> Command:
     """Import a verb and return its command, which is a group if that is what its module has."""
     own = re.sub("[- ]", "_", name)
@@ -183,6 +185,7 @@ def load_verb(name: str) -> Command:
         app.command(name)(getattr(home, own))
     for verb in app.registered_commands:
         _set_help(verb)
+        verb.callback = take_json(verb.callback)
     group = typer.main.get_group(app)
     group.name, group.short_help = name, group.help
     command: Any = group if is_group else group.commands[name]
@@ -341,7 +344,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     atexit.register(gc.freeze)
     with (
         _keep_to_one_line(debug or verbose),
-        replace_results(replacing),
+        holding(REPLACES, replacing),
         silence() if quiet else contextlib.nullcontext(),
     ):
         status = int(_run(words, debug) or 0)

@@ -10,10 +10,10 @@ and ``--wavelength-mm``. Flags win over the file; inside everything is in SI uni
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin,
 import tomli_w
 import typer
 
+from apps.report import PRINTS_JSON, holding
 from tofclip.errors import InputError, StorageError
 from tofclip.files import PICTURE_SUFFIXES, atomic_path, read_toml, suggest_name
 from tofclip.plugins import READERS
@@ -96,7 +97,6 @@ def _require_there(value: Any) -> Any:
     return value
 
 
-JSON = flag("--json", "Print one JSON object of figures and nothing else.")
 SEED = opt("N", "Of the photon noise.", 0, min=0)
 BIN_WIDTH = opt(
     "PS",
@@ -153,6 +153,7 @@ METAVARS = {
 }
 """Of the libraries' settings; the others show their unit, or N for a number without one."""
 
+KEYWORD = inspect.Parameter.KEYWORD_ONLY
 Settings = TypeVar("Settings", bound="DataclassInstance")
 Verb = TypeVar("Verb", bound=Callable[..., None])
 
@@ -202,15 +203,11 @@ class _Setting:
             rich_help_panel=HELP_PANEL,
         )
         annotated: Any = Annotated  # with a computed type, which no type checker can follow
-        return inspect.Parameter(
-            self.key,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=None,
-            annotation=annotated[self.hint | None, option],
-        )
+        hint = annotated[self.hint | None, option]
+        return inspect.Parameter(self.key, KEYWORD, default=None, annotation=hint)
 
 
-@cache
+@functools.cache
 def _list_settings(kind: type[DataclassInstance]) -> dict[str, _Setting]:
     """The settings of a class by their keys, its own before those that it inherits."""
     hints, own = get_type_hints(kind), inspect.get_annotations(kind)
@@ -230,17 +227,39 @@ def find_key(kind: type[DataclassInstance], name: str) -> str:
     return next((key for key, one in _list_settings(kind).items() if one.field.name == name), name)
 
 
-def add_setting_flags(kind: type[DataclassInstance]) -> Callable[[Verb], Verb]:
-    """Give a verb a flag for every setting; they reach its ``**flags``, None where absent."""
+def take_json(verb: Any) -> Any:
+    """Give a verb ``--json``."""
+
+    def run(as_json: bool, **words: Any) -> None:
+        with holding(PRINTS_JSON, as_json):
+            verb(**words)
+
+    option = flag("--json", "Print one JSON object of figures and nothing else.")
+    return _take(run, verb, inspect.Parameter("as_json", KEYWORD, default=option, annotation=bool))
+
+
+def take_settings(kind: type[DataclassInstance]) -> Callable[[Verb], Verb]:
+    """Give a verb a flag for every setting; its first argument is what they and a file say."""
 
     def with_flags(verb: Verb) -> Verb:
-        known = inspect.signature(verb, eval_str=True)
-        own = [one for one in known.parameters.values() if one.kind is not one.VAR_KEYWORD]
         flags = [one.make_flag() for one in _list_settings(kind).values()]
-        verb.__signature__ = known.replace(parameters=[*own, *flags])  # type: ignore[attr-defined]
-        return verb
+
+        def run(settings: Path | None, **words: Any) -> None:
+            given = {one.name: words.pop(one.name) for one in flags}
+            verb(load_settings(kind, settings, given), settings=settings, **words)
+
+        return _take(run, verb, *flags)
 
     return with_flags
+
+
+def _take(run: Callable[..., None], verb: Verb, *further: inspect.Parameter) -> Verb:
+    """Return what runs a verb by its own parameters that have a default and by further ones."""
+    known = inspect.signature(verb, eval_str=True)
+    own = [one for one in known.parameters.values() if one.default is not one.empty]
+    taking: Any = functools.wraps(verb)(run)
+    taking.__signature__ = known.replace(parameters=[*own, *further])
+    return taking
 
 
 def load_settings(kind: type[Settings], file: Path | None, flags: Mapping[str, Any]) -> Settings:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from apps.report import may_replace, name_options, report, say
+from apps.report import REPLACES, name_options, report, say
 from tofclip.errors import MissingDependencyError
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ def run_with_progress(
     """Run the jobs that are not done yet under a bar; `watch` is called with reports."""
     from tofclip.sequences.jobs import run_jobs, select_unfinished
 
-    if may_replace():
+    if REPLACES.get():
         for job in jobs:
             job.result.unlink(missing_ok=True)
     missing = select_unfinished(jobs)
@@ -189,7 +189,7 @@ def resolve_device(device: str, cluster: str | None) -> str:
 
 
 def report_summary(
-    summary: Summary, total: int, as_json: bool, out: Path, figures: Mapping[str, Any] | None = None
+    summary: Summary, total: int, out: Path, figures: Mapping[str, Any] | None = None
 ) -> None:
     """Print the figures of a sequence and its failures; `total`: of all its jobs."""
     failed = list_failures(summary)
@@ -203,10 +203,8 @@ def report_summary(
         "peak_memory_mib_per_process": summary.peak_bytes / BYTES_PER_MIB,
         **(figures or {}),
     }
-    if as_json:
-        listed = [{"name": name, "problem": problem} for name, problem in failed.items()]
-        figures |= {"failures": listed}
-    report(figures, as_json, [out])
+    listed = [{"name": name, "problem": problem} for name, problem in failed.items()]
+    report(figures | {"failures": listed}, [out], json_only=["failures"])
     end_with(failed)
 
 

@@ -42,29 +42,27 @@ OPTIONS_OF_ARGUMENTS = {
 """The command line's option for an argument that the libraries' messages name."""
 
 
-# From Python results are replaced, as any library does; see `replace_results`.
-_replaces = ContextVar("replaces", default=True)
+REPLACES = ContextVar("replaces", default=True)
+"""Whether results that exist are made again: from Python, as any library does."""
+
+PRINTS_JSON = ContextVar("prints_json", default=False)
+"""Whether `report` prints an object for programs."""
 
 
 @contextlib.contextmanager
-def replace_results(allowed: bool) -> Iterator[None]:
-    """Let verbs write over results that exist, or refuse to."""
-    before = _replaces.set(allowed)
+def holding(switch: ContextVar[bool], is_on: bool) -> Iterator[None]:
+    """Have one of the above on or off for a while."""
+    before = switch.set(is_on)
     try:
         yield
     finally:
-        _replaces.reset(before)
-
-
-def may_replace() -> bool:
-    """Say whether results that exist are made again."""
-    return _replaces.get()
+        switch.reset(before)
 
 
 def require_new(*results: Path) -> None:
     """Refuse to write over results that exist, unless that is allowed."""
     for result in results:
-        if result.exists() and not may_replace():
+        if result.exists() and not REPLACES.get():
             raise StorageError(f"{result}: exists already; name another, or give --overwrite")
 
 
@@ -152,18 +150,17 @@ def describe_ranges(frames: Frames) -> str:
 
 def report(
     figures: Mapping[str, Any],
-    as_json: bool,
     written: Sequence[Path] = (),
     note: str = "",
     json_only: Sequence[str] = (),
 ) -> None:
-    """Print the figures of a run: numbers, strings, and lists or mappings of these by name.
-    `as_json`: one object on one line (NaN becomes null) instead of a table; `written`: files to
-    name in the table, which leaves out what is not known; `note`: what has to be known about its
-    figures; `json_only`: figures that are for programs.
+    """Print the figures of a run, numbers, strings, and lists or mappings of these by name: a table,
+    which leaves out what is not known, or with `PRINTS_JSON` an object on one line (NaN becomes null).
+    `written`: files to name below the table; `note`: what has to be known about its figures;
+    `json_only`: figures that are for programs.
     """
     plain = to_json_value(figures)
-    if as_json:
+    if PRINTS_JSON.get():
         print(json.dumps(plain, allow_nan=False))
         return
     plain = {
@@ -285,7 +282,7 @@ def summarise_list(values: Sequence[Any]) -> str:
 
 def _format_value(value: Any) -> str:
     if isinstance(value, list):
-        long = len(value) > MAX_LISTED_VALUES
+        long = len(value) > MAX_LISTED_VALUES and not isinstance(value[0], str)
         return summarise_list(value) if long else ", ".join(map(_format_value, value))
     if isinstance(value, dict):
         known = {name: entry for name, entry in value.items() if entry not in (None, "")}

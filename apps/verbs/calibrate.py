@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apps.options import JSON, PICTURE_FORMATS, PREVIEW, SEED, arg, opt
+from apps.options import PICTURE_FORMATS, PREVIEW, SEED, arg, opt
 from apps.progress import show_activity, show_progress
 from apps.report import choose_preview, make_folder, report, require_writable
 from apps.verbs.photons import AXES, FIELD_OF_VIEW, FOCAL_LENGTH, choose_camera, require_view
@@ -52,7 +52,6 @@ def calibrate(
         shown="60",
     ),
     preview: Path | None = PREVIEW,
-    as_json: bool = JSON,
 ) -> None:
     """Find every view's slit centre and line angle, and draw the fits over the data.
 
@@ -79,20 +78,13 @@ def calibrate(
     # Options that were not given leave the defaults of the camera alone.
     found.camera(**{name: value for name, value in known.items() if value is not None}).save(out)
     save_figure(make_calibration_figure(found), preview)
-    angles, sigmas = np.rad2deg(found.angles), np.rad2deg(found.angle_uncertainty)
-    if as_json:
-        figures = {
-            "angles_deg": angles,
-            "centres_px": found.centres_px,
-            "centre_uncertainty_px": found.centre_uncertainty_px,
-        }
-        report(figures, as_json)
-        return
-    print("view   centre (px)        angle (deg)")
-    rows = zip(found.centres_px, found.centre_uncertainty_px, angles, sigmas, strict=True)
-    for view, (centre, error, angle, sigma) in enumerate(rows):
-        print(f"{view:4d}   {centre:8.2f} +- {error:4.2f}   {angle:7.2f} +- {sigma:4.2f}")
-    report({}, as_json, [out, preview])
+    figures = {
+        "angles_deg": np.rad2deg(found.angles),
+        "angle_uncertainty_deg": np.rad2deg(found.angle_uncertainty),
+        "centres_px": found.centres_px,
+        "centre_uncertainty_px": found.centre_uncertainty_px,
+    }
+    report(figures, [out, preview])
 
 
 def calibrate_range(
@@ -145,7 +137,6 @@ def calibrate_range(
     focal_length_px: float | None = FOCAL_LENGTH,
     field_of_view_deg: float = FIELD_OF_VIEW,
     preview: Path | None = PREVIEW,
-    as_json: bool = JSON,
 ) -> None:
     """Find time zero, range walk, offsets, response and reflectance from shots of a target.
 
@@ -199,7 +190,7 @@ def calibrate_range(
     found = fit_range_calibration(seen, walk=walk)
     found.camera.save(out)
     save_figure(make_range_calibration_figure(found, distances), preview)
-    report(_list_figures(found, len(shots)), as_json, [out, preview])
+    report(_list_figures(found, len(shots)), [out, preview])
 
 
 def _one_each(values: list[float], shots: int, option: str) -> list[float]:
@@ -338,7 +329,6 @@ def design(
     ),
     shots: int = opt("N", "Simulated shots of each scene; 0: predictions alone.", 20, min=0),
     seed: int = SEED,
-    as_json: bool = JSON,
 ) -> None:
     """Say what a CLIP instrument will see before it is built, by theory and by simulated shots.
 
@@ -370,7 +360,7 @@ def design(
         if out.suffix in PICTURE_SUFFIXES:
             raise InputError("--simulate writes a folder of shots; name it by --out")
         written = _write_shots(known[camera.stem], simulate, shots, seed, out)
-        report({"scene": simulate, "shots": shots, "seed": seed}, as_json, written)
+        report({"scene": simulate, "shots": shots, "seed": seed}, written)
         return
     written = [out]
     if compare is not None:
@@ -393,7 +383,7 @@ def design(
     else:  # side by side, their scenes below
         scenes = {f"{name}_scenes": one.pop("scenes") for name, one in told.items()}
         told |= scenes
-    report(told, as_json, written)
+    report(told, written)
 
 
 def _list_design_figures(found: DesignReport) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apps.cli import make_group
-from apps.options import JSON, arg, name_any, opt
+from apps.options import arg, name_any, opt
 from apps.progress import show_progress
 from apps.report import RECORD_SUFFIXES, build_provenance, report, require_writable, with_past
 from tofclip.errors import InputError
@@ -44,7 +44,6 @@ def simulate(
     seed: int = opt("N", "For angles, codes, photons and corrupted measurements.", 0, min=0),
     bad_fraction: float = opt("SHARE", "Measurements set to 0 or to the largest.", 0.0),
     photons: float | None = opt("N", "Photons of the largest measurement.", shown="no noise"),
-    as_json: bool = JSON,
 ) -> None:
     """Measure the true views of a light field with a camera of few measurements.
 
@@ -62,7 +61,7 @@ def simulate(
     past = {"verb": "clip simulate", **asdict(setup), **noise}
     with_past(measurement, past, light_field).save(out)
     figures = {"readings": measurement.values.size, "image_shape": measurement.image_shape}
-    report({**figures, **asdict(setup)}, as_json, [out])
+    report({**figures, **asdict(setup)}, [out])
 
 
 @app.command()
@@ -102,7 +101,6 @@ def recover(
     shear_range: tuple[float, float] = opt(
         "S S", "Nearest and farthest shear of surfaces to look for.", (-1.4, 1.4)
     ),
-    as_json: bool = JSON,
 ) -> None:
     """Recover the picture refocused at one depth, and one that is sharp at all depths.
 
@@ -169,7 +167,7 @@ def recover(
         **{name: getattr(found, name) for name in seconds},
     }
     _write_picture({"picture": picture}, out, measurement, past | {"weight": found.weight})
-    report(figures, as_json, outputs)
+    report(figures, outputs)
 
 
 def _find_surfaces(

@@ -13,9 +13,9 @@ from typing import Any
 import typer
 
 from apps.cli import make_group
-from apps.options import JSON, arg, opt
+from apps.options import arg, opt
 from apps.progress import show_share
-from apps.report import RECORD_SUFFIXES, build_provenance, may_replace, report, require_writable
+from apps.report import RECORD_SUFFIXES, REPLACES, build_provenance, report, require_writable
 from tofclip.errors import InputError
 
 EXIT_DAMAGED = 2
@@ -28,7 +28,7 @@ app = make_group(
 
 
 @app.command("list")
-def list_(as_json: bool = JSON) -> None:
+def list_() -> None:
     """Show the instruments that are connected, and the kinds of addresses there are.
 
     Example: tofclip devices list
@@ -37,19 +37,12 @@ def list_(as_json: bool = JSON) -> None:
 
     found = [asdict(one) for one in discover()]
     # Files have no opener of their own: the name's ending chooses one.
-    kinds = registry.list_schemes()
-    if as_json:
-        file_types = registry.list_endings()
-        report({"devices": found, "kinds": kinds, "file_types": file_types}, as_json)
-        return
-    for one in found:
-        print(f"{one['uri']:<24}{one['instrument']}{': ' if one['note'] else ''}{one['note']}")
-    print(f"instruments that are connected: {len(found) or 'none'}")
-    print(f"addresses begin with {', '.join(f'{kind}://' for kind in kinds)}")
+    figures = {"kinds": registry.list_schemes(), "file_types": registry.list_endings()}
+    report({"devices": found, **figures}, note="" if found else "no instrument is connected")
 
 
 @app.command()
-def info(uri: str = ADDRESS, as_json: bool = JSON) -> None:
+def info(uri: str = ADDRESS) -> None:
     """Say what is known about an instrument or a recording.
 
     Example: tofclip devices info 'sim+linospad2://?seed=1'
@@ -68,14 +61,13 @@ def info(uri: str = ADDRESS, as_json: bool = JSON) -> None:
         shapes = {name: list(entry.values.shape) for name, entry in calibration.fields.items()}
         figures |= {f"calibration_{name}": value for name, value in calibration.attributes.items()}
         figures |= {f"calibration_{name}_shape": shape for name, shape in shapes.items()}
-    report(figures, as_json)
+    report(figures)
 
 
 @app.command("test")
 def try_(
     uri: str = ADDRESS,
     seconds: float = opt("S", "How long to read.", 5.0),
-    as_json: bool = JSON,
 ) -> None:
     """Read and decode for a while, and say how fast and how well that went.
 
@@ -86,11 +78,11 @@ def try_(
 
     with show_share("reading", seconds) as watch:
         trial = measure_throughput(devices.open(uri), seconds, watch)
-    report(trial.figures, as_json)
+    report(trial.figures)
 
 
 @app.command()
-def verify(file: Path = RECORDING, as_json: bool = JSON) -> None:
+def verify(file: Path = RECORDING) -> None:
     """Read a recording from end to end and compare it with its checksums and accounts; exit status
     2 if it is damaged.
 
@@ -101,7 +93,7 @@ def verify(file: Path = RECORDING, as_json: bool = JSON) -> None:
     from devices.recording import check
 
     found = check.verify(file)
-    report(found.as_dict(), as_json)
+    report(found.as_dict())
     # The findings are printed in either case; only the exit status differs.
     if not found.is_sound:
         hint = "is damaged; tofclip devices repair makes a sound copy"
@@ -115,7 +107,6 @@ def verify(file: Path = RECORDING, as_json: bool = JSON) -> None:
 def repair(
     file: Path = RECORDING,
     out: Path = opt("H5", "The sound copy to write.", ...),
-    as_json: bool = JSON,
 ) -> None:
     """Copy all that is sound of a damaged or unfinished recording, and mark where something is
     missing.
@@ -125,14 +116,13 @@ def repair(
     from devices.recording import check
 
     require_writable(out, *RECORD_SUFFIXES, inputs=(file,))
-    report(check.repair(file, out).as_dict(), as_json, [out])
+    report(check.repair(file, out).as_dict(), [out])
 
 
 def record(
     uri: str = arg("URI", "Such as timetag://SERIAL, or 'sim+timetag://?seed=1'; see devices."),
     out: Path = opt("H5", "The recording to write.", ...),
     seconds: float | None = opt("S", "How long.", shown="until its end, or Ctrl-C"),
-    as_json: bool = JSON,
 ) -> None:
     """Record an instrument: its bytes as they come, with clock, accounts and calibration.
 
@@ -150,5 +140,5 @@ def record(
     past = build_provenance({"verb": "record", "uri": uri, "seconds": seconds})
     limit = math.inf if seconds is None else seconds
     with show_share("recording", seconds) as watch:
-        done = record_source(devices.open(uri), out, limit, past, watch, may_replace())
-    report({"seconds": done.seconds, "bytes": done.bytes, **done.figures}, as_json, [out])
+        done = record_source(devices.open(uri), out, limit, past, watch, REPLACES.get())
+    report({"seconds": done.seconds, "bytes": done.bytes, **done.figures}, [out])

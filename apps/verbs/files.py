@@ -6,9 +6,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apps.options import JSON, STREAK_IMAGE, arg, opt
+from apps.options import STREAK_IMAGE, arg, opt
 from apps.report import (
     MAX_LISTED_VALUES,
+    PRINTS_JSON,
     RECORD_SUFFIXES,
     report,
     require_writable,
@@ -27,7 +28,6 @@ def convert(
     bin_width: float | None = opt(
         "PS", "Duration of a row in ps, where the file does not say it.", name="--bin-width-ps"
     ),
-    as_json: bool = JSON,
 ) -> None:
     """Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall
     inside.
@@ -46,14 +46,13 @@ def convert(
         "has_camera": shot.camera is not None,
         "attachments": list(shot.attachments),
     }
-    report(figures, as_json, [out])
+    report(figures, [out])
 
 
 def info(
     file: Path = arg(
         "FILE", "Any file of ours, or a streak image or ROS 2 bag of others.", read=True
     ),
-    as_json: bool = JSON,
 ) -> None:
     """Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.
 
@@ -63,8 +62,8 @@ def info(
     Example: tofclip info frames.h5
     """
     found = to_json_value({"file": file, **describe_file(file)})
-    if as_json:
-        report(found, as_json)
+    if PRINTS_JSON.get():
+        report(found)
     else:
         print("\n".join(_format_tree(found)))
 

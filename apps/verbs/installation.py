@@ -24,9 +24,9 @@ from typing import Any
 import typer
 
 from apps.cli import EXIT_INTERRUPTED
-from apps.options import JSON, SEED, arg, opt
+from apps.options import SEED, arg, opt
 from apps.progress import show_activity, show_progress
-from apps.report import make_folder, report, require_new, with_past
+from apps.report import PRINTS_JSON, make_folder, report, require_new, with_past
 from devices.address import Options
 from tofclip.errors import InputError
 from tofclip.files import describe_missing_package
@@ -41,7 +41,7 @@ NOT_FOR_VERBS = {"test", "lint", "docs", "all"}
 EXIT_BROKEN, GIB = 1, 1 << 30
 
 
-def doctor(as_json: bool = JSON) -> None:
+def doctor() -> None:
     """Say what this installation has: packages, GPU, USB, compiled loops, graphics, disk and memory.
 
     Optional packages that are missing are listed with the command that installs them. The exit
@@ -68,8 +68,8 @@ def doctor(as_json: bool = JSON) -> None:
         "missing": [f"{name}: {found}" for name, found in packages.items() if "pip" in found],
         "faults": faults,
     }
-    report({**figures, **(lists if as_json else {})}, as_json)
-    for name, lines in {} if as_json else lists.items():
+    report({**figures, **(lists if PRINTS_JSON.get() else {})})
+    for name, lines in {} if PRINTS_JSON.get() else lists.items():
         print(f"{name}:", *(lines or ["none"]), sep="\n  ")
     if faults:
         raise typer.Exit(EXIT_BROKEN)
@@ -151,7 +151,7 @@ IMAGINGS = (
 """Walls, scans, and the methods to run on them."""
 
 
-def warm_up(as_json: bool = JSON) -> None:
+def warm_up() -> None:
     """Run everything that is compiled on first use once, on small data.
 
     Compiled code is kept beside the program, or in NUMBA_CACHE_DIR; later runs load it. After an
@@ -168,7 +168,7 @@ def warm_up(as_json: bool = JSON) -> None:
                 words = [word.replace("@", f"{folder}/") for word in step.split()]
                 _run_quietly([*words, "--overwrite"])  # steps write under the same names
                 advance(1)
-    report({"steps": len(steps), "seconds": time.perf_counter() - started}, as_json)
+    report({"steps": len(steps), "seconds": time.perf_counter() - started})
 
 
 def list_steps() -> list[str]:
@@ -236,7 +236,6 @@ BORDER_PX = 12  # views leave the slit there, so the picture's rim is not scored
 def demo(
     out: Path = opt("DIR", "Folder for the results; made if missing.", Path("demo-output")),
     seed: int = SEED,
-    as_json: bool = JSON,
 ) -> None:
     """Simulate a scene of letters and plates, recover it from one streak image, and compare with
     the truth.
@@ -295,7 +294,7 @@ def demo(
         "points": len(cloud),
         "seconds": time.perf_counter() - started,
     }
-    report(figures, as_json, written)
+    report(figures, written)
 
 
 TEXT_WIDTH = 70  # columns, of a part's meaning in the list of all
@@ -303,7 +302,6 @@ TEXT_WIDTH = 70  # columns, of a part's meaning in the list of all
 
 def plugins(
     name: str | None = arg("NAME", "Of one part: show its settings.", None),
-    as_json: bool = JSON,
 ) -> None:
     """List methods, denoisers, readers and instruments, by whom they are, and what does not load.
 
@@ -317,8 +315,8 @@ def plugins(
     shown = [one for one in list_parts() if name in (None, one["name"])]
     if not shown:
         raise InputError(f"no part is called '{name}'; tofclip plugins lists them all")
-    if as_json:
-        report({"parts": shown}, as_json)
+    if PRINTS_JSON.get():
+        report({"parts": shown})
         return
     width = max(len(one["name"]) for one in shown)
     for one in shown:

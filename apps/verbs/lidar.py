@@ -15,7 +15,6 @@ from apps.options import (
     CLUSTER,
     FOCUS,
     FRAME_ID,
-    JSON,
     PICTURE_FORMATS,
     SUFFIX,
     TIME_ZERO,
@@ -26,6 +25,7 @@ from apps.options import (
 )
 from apps.progress import report_summary, run_with_progress, show_activity, show_progress
 from apps.report import (
+    PRINTS_JSON,
     RECORD_SUFFIXES,
     describe_ranges,
     make_folder,
@@ -63,7 +63,6 @@ def bag(
     suffix: str = SUFFIX,
     rate_hz: float = opt("HZ", "Clouds a second, in the order of their names.", 10.0),
     start_s: float = opt("S", "Stamp of the first cloud, since the epoch.", 0.0),
-    as_json: bool = JSON,
 ) -> None:
     """Write clouds with stamps as ROS 2 messages (sensor_msgs/PointCloud2 in an optical frame), or the
     clouds of such a recording, whichever program made it, as files.
@@ -91,7 +90,7 @@ def bag(
             points += len(one.cloud)
             stamps.append(one.stamp_ns)
         seconds = (stamps[-1] - stamps[0]) / NANOSECONDS_PER_SECOND if stamps else 0.0
-        report({"clouds": len(stamps), "points": points, "seconds": seconds}, as_json, [out])
+        report({"clouds": len(stamps), "points": points, "seconds": seconds}, [out])
         return
     files = [
         file
@@ -115,7 +114,7 @@ def bag(
     with show_progress("writing", len(files)) as advance:
         number = ros.write_bag(read(), out, topic or ros.TOPIC, frame_id)
     figures = {"clouds": number, "points": points, "seconds": (number - 1) / rate_hz}
-    report(figures, as_json, [out])
+    report(figures, [out])
 
 
 @app.command()
@@ -136,7 +135,6 @@ def accuracy(
     ),
     trials: int = opt("N", "Histograms with a return, and as many without.", 2000),
     seed: int = opt("N", "Of the photons' chance.", 0),
-    as_json: bool = JSON,
 ) -> None:
     """Locate returns in simulated photon histograms and compare the error with the Cramer-Rao
     bound.
@@ -153,7 +151,7 @@ def accuracy(
     detector = PhotonDetector(pulse, bin_width, bins, false_alarm_rate)
     with show_progress("simulating", max(trials, 1)) as advance:
         found = measure_accuracy(detector, photons, background, trials, seed, advance)
-    report(asdict(found), as_json)
+    report(asdict(found))
 
 
 @app.command()
@@ -166,7 +164,6 @@ def parallax(
     shears: tuple[float, float, int] = opt(
         "S0 S1 N", "Shears tried, pixels per view step.", (-3.0, 3.0, 13)
     ),
-    as_json: bool = JSON,
 ) -> None:
     """Find lenslet pitch and focus distance from a shot: at which shear the views agree, gate by
     gate.
@@ -194,7 +191,7 @@ def parallax(
         "shear_px": found.curve.shears,
         "weight": found.curve.weight,
     }
-    report(figures, as_json, [out])
+    report(figures, [out])
 
 
 @app.command()
@@ -203,7 +200,6 @@ def scene(
     out: Path = opt("PNG", f"The picture to write: {PICTURE_FORMATS}.", ...),
     reach: float = opt("MM", "Points this close belong together.", 40.0, name="--reach-mm"),
     fewest_points: int = opt("N", "Smaller groups are not objects.", 40),
-    as_json: bool = JSON,
 ) -> None:
     """List a scene's objects with range, size and standard deviation; draw them from three sides.
 
@@ -241,13 +237,9 @@ def scene(
         {f"{name}_m": getattr(one, name) for name in named} | {"points": one.points.size}
         for one in objects
     ]
-    if as_json:
-        # `confidence_m` is the deviation's earlier name: for one more version
-        renamed = [row | {"confidence_m": row["range_sigma_m"]} for row in rows]
-        report({"points": len(cloud), "objects": renamed}, as_json)
-        return
-    table = {f"object {number}": row for number, row in enumerate(rows, 1)}
-    report(table, as_json, [out], describe_ranges(recovered))
+    if PRINTS_JSON.get():  # the deviation's earlier name: for one more version
+        rows = [row | {"confidence_m": row["range_sigma_m"]} for row in rows]
+    report({"points": len(cloud), "objects": rows}, [out], describe_ranges(recovered))
 
 
 @app.command()
@@ -268,7 +260,6 @@ def sequence(
         "--keep-jitter", "Do not find how late each shot comes against the first."
     ),
     cluster: str | None = CLUSTER,
-    as_json: bool = JSON,
 ) -> None:
     """Make a cloud of each shot by the linear inverse, one shot in memory at a time.
 
@@ -299,4 +290,4 @@ def sequence(
         # Root mean square; 0 where nothing was done, and of one shot but for rounding.
         "jitter_rms_bins": round((sum(one**2 for one in late) / max(len(late), 1)) ** 0.5, 6),
     }
-    report_summary(summary, len(jobs), as_json, out, figures)
+    report_summary(summary, len(jobs), out, figures)

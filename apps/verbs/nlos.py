@@ -18,10 +18,8 @@ from apps.cli import make_group
 from apps.options import (
     CLUSTER,
     DEVICE,
-    JSON,
     PICTURE_FORMATS,
     SETTINGS,
-    add_setting_flags,
     arg,
     load_settings,
     name_any,
@@ -29,6 +27,7 @@ from apps.options import (
     save_settings,
     setting,
     settings_to_dict,
+    take_settings,
 )
 from apps.progress import (
     end_with,
@@ -38,9 +37,10 @@ from apps.progress import (
     show_activity,
 )
 from apps.report import (
+    PRINTS_JSON,
     RECORD_SUFFIXES,
+    REPLACES,
     make_folder,
-    may_replace,
     name_beside,
     report,
     require_writable,
@@ -177,8 +177,9 @@ def note_content(source: Path) -> str:
 
 
 @app.command()
-@add_setting_flags(ReconstructSettings)
+@take_settings(ReconstructSettings)
 def reconstruct(
+    wanted: ReconstructSettings,
     source: Path = arg(
         "CAPTURE", "Recovered frames of a relay wall, a capture, or a folder.", read=True
     ),
@@ -195,8 +196,6 @@ def reconstruct(
     ),
     cluster: str | None = CLUSTER,
     device: str = DEVICE,
-    as_json: bool = JSON,
-    **flags: Any,
 ) -> None:
     """Image the hidden scene from the transients on a relay wall.
 
@@ -224,7 +223,6 @@ def reconstruct(
 
     Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png --surface mesh.ply
     """
-    wanted = load_settings(ReconstructSettings, settings, flags)
     # Settings that no capture could make sense of are refused before any is read.
     if not 0 <= wanted.point_fraction <= 1:
         raise InputError(f"point_fraction is a share between 0 and 1, got {wanted.point_fraction}")
@@ -236,15 +234,13 @@ def reconstruct(
     if is_capture_folder(source):
         if surface is not None:
             raise InputError(f"{source}: --surface is for a single capture, and this is a folder")
-        _reconstruct_folder(
-            (source, settings), out, wanted, suffix or [".h5"], device, cluster, as_json
-        )
+        _reconstruct_folder((source, settings), out, wanted, suffix or [".h5"], device, cluster)
         return
     if cluster is not None:
         raise InputError(f"{source}: --cluster is for a folder of captures")
     results = ResultFiles([out], png, name_beside(out, ".toml"), surface)
     results.require_writable(source, settings)
-    report(reconstruct_single(source, results, wanted, device), as_json, results.paths)
+    report(reconstruct_single(source, results, wanted, device), results.paths)
 
 
 def _check_refinement(wanted: ReconstructSettings) -> None:
@@ -387,7 +383,6 @@ def _reconstruct_folder(
     suffixes: Sequence[str],
     device: str,
     cluster: str | None,
-    as_json: bool,
 ) -> None:
     """Image every capture of a folder whose results are not there yet."""
     from tofclip.sequences.jobs import Job, run_jobs
@@ -406,7 +401,7 @@ def _reconstruct_folder(
     _check_folder_settings(out / FOLDER_SETTINGS_NAME, wanted)
     jobs, skipped, imaged = [], [], list[dict[str, Any]]()
     for path, made in results.items():
-        if made.is_up_to_date(path) and not may_replace():
+        if made.is_up_to_date(path) and not REPLACES.get():
             skipped.append(path.name)
             continue
         made.settings.unlink(missing_ok=True)  # it says that results are whole, and these are old
@@ -428,8 +423,8 @@ def _reconstruct_folder(
     failed = list_failures(summary)
     lists = {"imaged": imaged, "skipped": skipped, "failed": failed}
     counts = {"imaged": summary.done, "skipped": len(skipped), "failed": len(failed)}
-    figures = {"captures": len(sources), **(lists if as_json else counts)}
-    report(figures, as_json, [out])
+    figures = {"captures": len(sources), **(lists if PRINTS_JSON.get() else counts)}
+    report(figures, [out])
     end_with(failed)
 
 
@@ -462,13 +457,8 @@ for verb in (stream, film, compare, simulate):
 
 
 @app.command()
-@add_setting_flags(ImagingSettings)
-def info(
-    source: Path = CAPTURE,
-    settings: Path | None = SETTINGS,
-    as_json: bool = JSON,
-    **flags: Any,
-) -> None:
+@take_settings(ImagingSettings)
+def info(wanted: ImagingSettings, source: Path = CAPTURE, settings: Path | None = SETTINGS) -> None:
     """Report a capture's geometry and sampling, usable wavelengths, resolution, and which methods
     suit it.
 
@@ -486,7 +476,7 @@ def info(
     with show_activity(f"reading {source.name}"):
         recorded = read_capture(source)
     with show_activity("finding settings"):
-        found = find_settings(recorded, load_settings(ImagingSettings, settings, flags))
+        found = find_settings(recorded, wanted)
     capture, grid = found.prepare(recorded), found.grid()
     shown = settings_to_dict(found)
     middle = [axis[[0, -1]].mean() for axis in (grid.x, grid.y, grid.z)]
@@ -514,18 +504,14 @@ def info(
         "truth": HiddenTruth.find(source) is not None,
     }
     memory, refused = try_methods(found, METHODS, capture, grid)
-    mib = {name: size / 2**20 for name, size in memory.items()}
-    if as_json:
-        suits = {name: {"suits": True, "memory_mib": size} for name, size in mib.items()}
-        others = {name: {"suits": False, "reason": reason} for name, reason in refused.items()}
-        report({**figures, "methods": suits | others}, as_json)
-        return
-    lines = {name: f"yes, {size:.0f} MiB" for name, size in mib.items()}
-    lines |= {name: f"no: {reason}" for name, reason in refused.items()}
+    suits: dict[str, dict[str, Any]] = {
+        name: {"suits": True, "memory_mib": size / 2**20} for name, size in memory.items()
+    }
+    suits |= {name: {"suits": False, "reason": reason} for name, reason in refused.items()}
     note = ""
     if shown["wavelength_mm"] < usable["shortest"]:
         note = "the wall samples the shortest wavelength at every angle, the chosen one at that of the brightest light"
-    report({**figures, **lines}, as_json, note=note)
+    report({**figures, "methods": suits}, note=note)
 
 
 def _describe_wall(capture: Capture) -> dict[str, Any]:

@@ -15,18 +15,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from apps.options import (
-    JSON,
     PICTURE_FORMATS,
     SEED,
     SETTINGS,
-    add_setting_flags,
     arg,
     find_key,
-    load_settings,
     opt,
     save_settings,
     setting,
     settings_to_dict,
+    take_settings,
 )
 from apps.progress import show_activity, show_progress
 from apps.report import (
@@ -275,14 +273,13 @@ class CompareSettings(ImagingSettings):
     )
 
 
-@add_setting_flags(CompareSettings)
+@take_settings(CompareSettings)
 def compare(
+    wanted: CompareSettings,
     source: Path = CAPTURE,
     out: Path = opt("PNG", f"The picture to write: {PICTURE_FORMATS}.", ...),
     volumes: Path | None = opt("DIR", "Folder for the volumes, one file per method."),
     settings: Path | None = SETTINGS,
-    as_json: bool = JSON,
-    **flags: Any,
 ) -> None:
     """Image one capture by several methods, and show images, time, memory and figures of merit side
     by side.
@@ -307,7 +304,6 @@ def compare(
     )
     from tofclip.notebook import save_figure
 
-    wanted = load_settings(CompareSettings, settings, flags)
     written = [out, name_beside(out, ".toml")]
     require_writable(out, *PICTURE_SUFFIXES, inputs=(source, settings))
     require_writable(written[1], inputs=(source, settings))
@@ -346,20 +342,14 @@ def compare(
             written.append(volumes / f"{name}.h5")
             with_past(volume, past, source).save(written[-1])
     save_settings(found, written[1], "tofclip nlos compare CAPTURE --settings THIS --out PICTURE")
-    shape = {"voxels": grid.shape}
-    if as_json:
-        report({**shape, "methods": figures, "left_out": left_out}, as_json)
-        return
-    reasons = {name: f"no: {reason}" for name, reason in left_out.items()}
-    report({**shape, **figures, **reasons}, as_json, written)
+    report({"voxels": grid.shape, "methods": figures, "left_out": left_out}, written)
 
 
-@add_setting_flags(SceneSettings)
+@take_settings(SceneSettings)
 def simulate(
+    chosen: SceneSettings,
     out: Path = opt("H5", "The capture to write.", ...),
     settings: Path | None = SETTINGS,
-    as_json: bool = JSON,
-    **flags: Any,
 ) -> None:
     """Simulate the capture of a known hidden scene before a relay wall.
 
@@ -370,7 +360,6 @@ def simulate(
     """
     from nlos.known_scenes import simulate_scene
 
-    chosen = load_settings(SceneSettings, settings, flags)
     inputs = [Path(path) for path in (settings, chosen.mesh) if path]
     beside = name_beside(out, ".toml")
     require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
@@ -389,7 +378,7 @@ def simulate(
         "total": capture.signal.sum(dtype="float64"),
         "seconds": time.perf_counter() - started,
     }
-    report(figures, as_json, [out, beside])
+    report(figures, [out, beside])
 
 
 @dataclass(frozen=True)
@@ -409,7 +398,6 @@ def demo(
         "PNG", f"The picture to write: {PICTURE_FORMATS}.", shown="nlos_demo.png in --out"
     ),
     seed: int = SEED,
-    as_json: bool = JSON,
 ) -> None:
     """Hide two characters before a curved wall, simulate what the wall shows, and image them by two
     methods.
@@ -452,7 +440,7 @@ def demo(
         "times_faster": slow.seconds / run.images["hybrid"].seconds,
         "seconds": time.perf_counter() - started,
     }
-    report(figures, as_json, [*written, picture])
+    report(figures, [*written, picture])
 
 
 def run_demo(seed: int) -> DemoRun:

@@ -18,16 +18,14 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from apps.options import (
-    JSON,
     SETTINGS,
-    add_setting_flags,
     arg,
     flag,
-    load_settings,
     opt,
     save_settings,
     setting,
     settings_to_dict,
+    take_settings,
 )
 from apps.progress import EXIT_SOME_FAILED, show_progress
 from apps.report import (
@@ -94,8 +92,9 @@ class StreamSettings(Settings):
     )
 
 
-@add_setting_flags(StreamSettings)
+@take_settings(StreamSettings)
 def stream(
+    wanted: StreamSettings,
     source: Path = arg("SOURCE", "A folder of captures, or a single one.", read=True),
     out: Path = opt("DIR", "Where the volumes go, one .h5 each.", ...),
     follow_s: float = opt(
@@ -108,8 +107,6 @@ def stream(
     ),
     view: bool = flag("--view", "Show the volumes on a page as they come."),
     settings: Path | None = SETTINGS,
-    as_json: bool = JSON,
-    **flags: Any,
 ) -> None:
     """Image every capture of a stream by one plan, and tell rate and latency.
 
@@ -126,7 +123,7 @@ def stream(
     from nlos.method import PhasorPlan
     from nlos.video import DepthAverage
 
-    wanted = replace(load_settings(StreamSettings, settings, flags), everywhere=True)
+    wanted = replace(wanted, everywhere=True)
     _check_stream(wanted, follow_s, captures)
     renderings = (path.parent for path in source.glob(f"*/{GEOMETRY_FILE}"))
     existing = list(out.glob("*.h5"))
@@ -152,7 +149,7 @@ def stream(
     made = VolumeStream(chain([first], coming), prepared, imaging, out, follow_s > 0)
     figures = _run_with_page(made, source) if view else made.run()
     figures = {"method": method, "voxels": prepared.grid.shape, **figures, "plan_s": planned}
-    report(figures, as_json, [out])
+    report(figures, [out])
     if figures["failed"]:
         raise typer.Exit(EXIT_SOME_FAILED)
 
@@ -359,13 +356,12 @@ class FilmSettings(Settings):
     )
 
 
-@add_setting_flags(FilmSettings)
+@take_settings(FilmSettings)
 def film(
+    wanted: FilmSettings,
     source: Path = CAPTURE,
     out: Path = opt("FILE", "The film to write, .mp4 or .gif; or its numbers, .h5.", ...),
     settings: Path | None = SETTINGS,
-    as_json: bool = JSON,
-    **flags: Any,
 ) -> None:
     """Film the hidden scene while the laser's flash passes through it.
 
@@ -384,7 +380,6 @@ def film(
     from nlos.illumination import find_leg_bounds
     from nlos.io import read_capture
 
-    wanted = load_settings(FilmSettings, settings, flags)
     beside = name_beside(out, ".toml")
     require_writable(out, *FILM_SUFFIXES, inputs=(source, settings))
     require_writable(beside, inputs=(source, settings))
@@ -435,7 +430,7 @@ def film(
         "last_ns": shown["last_ns"],
         "seconds": seconds,
     }
-    report(figures, as_json, [out, beside])
+    report(figures, [out, beside])
 
 
 def _check_film(settings: FilmSettings, out: Path) -> None:

@@ -7,9 +7,9 @@ import time
 from pathlib import Path
 
 from apps.cli import make_group
-from apps.options import JSON, NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, flag, opt
+from apps.options import NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, flag, opt
 from apps.progress import show_activity, show_progress
-from apps.report import make_folder, report, require_new, require_writable
+from apps.report import PRINTS_JSON, make_folder, report, require_new, require_writable
 from tofclip.errors import InputError, require_known
 from tofclip.files import PICTURE_SUFFIXES
 
@@ -32,7 +32,6 @@ def region(
     width: float = opt("MM", "Width of the occluder's solid part.", 6.0, name="--width-mm"),
     distance: float = opt("MM", "From the views to the occluder.", 50.0, name="--distance-mm"),
     out: Path | None = opt("PNG", f"Draw it: {PICTURE_FORMATS}.", shown="no picture"),
-    as_json: bool = JSON,
 ) -> None:
     """Report how far behind a solid occluder nothing can be seen by any view.
 
@@ -52,12 +51,14 @@ def region(
     if out is not None:
         save_figure(make_region_figure(found), out)
     figures = {
-        "inactive_length_m": found.length if found.is_bounded or as_json else "without end",
+        "inactive_length_m": found.length
+        if found.is_bounded or PRINTS_JSON.get()
+        else "without end",
         "promised": "seen beyond the inactive length"
         if found.is_bounded
         else "nothing: the occluder is no narrower than the baseline",
     }
-    report(figures, as_json, [] if out is None else [out])
+    report(figures, [] if out is None else [out])
 
 
 @app.command()
@@ -94,7 +95,6 @@ def demo(
     time_zero: float | None = TIME_ZERO,
     port: int | None = PORT,
     no_browser: bool = NO_BROWSER,
-    as_json: bool = JSON,
 ) -> None:
     """Simulate a scene behind an occluder, see through it, and compare with other cameras and with
     the truth.
@@ -151,7 +151,7 @@ def demo(
                 else GatedSource(open_source(recording, known))
             )
         with contextlib.closing(source) as opened:
-            PageDoor(LOOPBACK, port, no_browser, as_json).serve(Session(opened))
+            PageDoor(LOOPBACK, port, no_browser).serve(Session(opened))
         return
     if out is None:
         raise InputError("give --out DIR, or --live for a page")
@@ -196,4 +196,4 @@ def demo(
         "readings": measurement_count,
         "seconds": time.perf_counter() - started,
     }
-    report(figures, as_json, written)
+    report(figures, written)

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apps.options import JSON, PICTURE_FORMATS, arg, flag, name_any, opt
+from apps.options import PICTURE_FORMATS, arg, flag, name_any, opt
 from apps.progress import show_share
 from apps.report import build_provenance, report, require_writable, say
 from apps.verbs.recover import CLOUD_SUFFIXES, DEPTH_SUFFIX
@@ -106,7 +106,6 @@ def photons(
     returns: int = opt(
         "N", "Surfaces looked for in each pixel; pictures, .exr among them, show the strongest.", 1
     ),
-    as_json: bool = JSON,
 ) -> None:
     """Find the surface that counted photons show, with the deviation of every range.
 
@@ -200,7 +199,7 @@ def photons(
     if camera is None and focal_length_px is None and suffix in POINT_SUFFIXES:
         view = f"a view of {field_of_view_deg:g} degrees (--field-of-view-deg)"
         assumed.append(f"widths and heights are those of {view}")
-    report(figures, as_json, [out], "; ".join(assumed))
+    report(figures, [out], "; ".join(assumed))
 
 
 def find_doubt(

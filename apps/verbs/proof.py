@@ -8,9 +8,9 @@ from pathlib import Path
 
 import typer
 
-from apps.options import CLUSTER, JSON, arg, opt
+from apps.options import CLUSTER, arg, opt
 from apps.progress import report_summary, show_progress
-from apps.report import make_folder, report, require_writable
+from apps.report import PRINTS_JSON, make_folder, report, require_writable
 from tofclip.errors import InputError
 from tofclip.files import atomic_path, require_apart
 
@@ -28,7 +28,6 @@ def bench(
         "A Python that has other programs to compare with: pip install y-tal pyfftw astra-toolbox lensless.",
         shown="none",
     ),
-    as_json: bool = JSON,
 ) -> None:
     """Measure time and memory, each beside the least that the work needs.
 
@@ -51,8 +50,8 @@ def bench(
         command = "tofclip bench" if name == "all" else f"tofclip bench {name}"
         with atomic_path(page) as temporary:
             temporary.write_text(render_page(figures, command), encoding="utf-8")
-    if as_json:
-        report(figures, as_json)
+    if PRINTS_JSON.get():
+        report(figures)
         return
     lines = {}
     for entry in figures["entries"]:
@@ -62,7 +61,7 @@ def bench(
             f"{run['seconds']['median']:.4g} s at {run['size']} {entry['size']}, {run['times_floor']:.2f} times "
             f"{entry['floor']}, {run['peak_mib']:.0f} MiB"
         )
-    report(lines, as_json, [] if page is None else [page])
+    report(lines, [] if page is None else [page])
 
 
 def _complete_study(incomplete: str) -> list[str]:
@@ -82,7 +81,6 @@ def reproduce(
     data: Path | None = opt("DIR", "Recorded data: DIR/lightfields/*.npz are studied as well."),
     seeds: int = opt("N", "Repeats with other angles, codes and noise.", 3, min=1),
     cluster: str | None = CLUSTER,
-    as_json: bool = JSON,
 ) -> None:
     """Make tables and figures of the paper again, its figures beside ours.
 
@@ -124,6 +122,6 @@ def reproduce(
     page = paper.write_page(paper.load_all_results(library, seeds, folder), out)
     figures = {result["name"]: paper.summarise_result(result) for result in results}
     if summary is None:
-        report({"seeds": seeds, **figures}, as_json, [page])
+        report({"seeds": seeds, **figures}, [page])
         return
-    report_summary(summary, len(possible), as_json, page, {"seeds": seeds, **figures})
+    report_summary(summary, len(possible), page, {"seeds": seeds, **figures})

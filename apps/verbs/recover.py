@@ -21,7 +21,6 @@ from apps.options import (
     DEVICE,
     FOCUS,
     FRAME_ID,
-    JSON,
     PREVIEW,
     STREAK_IMAGE,
     SUFFIX,
@@ -124,7 +123,6 @@ def recover(
     ),
     cluster: str | None = CLUSTER,
     device: str = DEVICE,
-    as_json: bool = JSON,
 ) -> None:
     """Recover every transient frame of a raw streak image, or of each one of a sequence.
 
@@ -171,7 +169,7 @@ def recover(
         swept = expand_sweep(recovery, {name: values.split(",") for name, _, values in tried})
         jobs = [job for label, one in swept.items() for job in one.jobs(shots, out / label)]
         summary = run_with_progress("recovering", jobs, cluster)
-        report_summary(summary, len(jobs), as_json, out, {"device": used})
+        report_summary(summary, len(jobs), out, {"device": used})
         return
     if cluster is not None or sweep:
         option = "--sweep" if cluster is None else "--cluster"
@@ -241,7 +239,7 @@ def recover(
         **{name: known[name] for name in further if name in known},
     }
     written = [out, preview, *([cloud] if cloud else [])]
-    report(figures, as_json, written, json_only=("seconds", "frames_per_second"))
+    report(figures, written, json_only=("seconds", "frames_per_second"))
 
 
 def cloud(
@@ -274,7 +272,6 @@ def cloud(
     suffix: str = opt(".EXT", "Format of the clouds of a sequence.", ".ply"),
     cluster: str | None = CLUSTER,
     device: str = DEVICE,
-    as_json: bool = JSON,
 ) -> None:
     """Find each pixel's returns and place them in space: x right, y down, z forward, in metres.
 
@@ -310,7 +307,7 @@ def cloud(
         summary = run_with_progress(
             "placing", jobs, cluster, lambda one: counts.append(one.figures or 0)
         )
-        report_summary(summary, len(jobs), as_json, out, {"points": sum(counts), "device": used})
+        report_summary(summary, len(jobs), out, {"points": sum(counts), "device": used})
         return
     # An option without effect is refused rather than ignored.
     if cluster is not None:
@@ -332,7 +329,7 @@ def cloud(
         "returns_per_pixel_mean": len(points) / (rows * columns),
         "device": used,
     }
-    report(figures, as_json, [out], describe_ranges(recovered))
+    report(figures, [out], describe_ranges(recovered))
 
 
 def require_format(suffix: str, *further: str) -> None:
@@ -377,7 +374,6 @@ def stream(
     suffix: str = SUFFIX,
     topic: str | None = TOPIC,
     frame_id: str = FRAME_ID,
-    as_json: bool = JSON,
 ) -> None:
     """Make a cloud of each shot while the next ones come; report method, rate and latencies.
 
@@ -454,7 +450,7 @@ def stream(
         "dropped": accounts.dropped,
         **asdict(accounts),
     }
-    report(figures, as_json, [] if out is None else [out], json_only=["latency_s"])
+    report(figures, [] if out is None else [out], json_only=["latency_s"])
     if failed:
         raise typer.Exit(EXIT_SOME_FAILED)
 

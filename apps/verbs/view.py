@@ -7,7 +7,7 @@ import time
 from functools import partial
 from pathlib import Path
 
-from apps.options import JSON, NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, arg, flag, opt
+from apps.options import NO_BROWSER, PICTURE_FORMATS, PORT, TIME_ZERO, arg, flag, opt
 from apps.progress import show_activity, show_progress
 from apps.report import report, require_writable
 from tofclip.errors import InputError
@@ -48,7 +48,6 @@ def view(
         "PNG", f"Write a picture, without a screen: {PICTURE_FORMATS}.", shown="none"
     ),
     mp4: Path | None = opt("MP4", "Write a film, without a screen.", shown="none"),
-    as_json: bool = JSON,
 ) -> None:
     """Look at a source: on a page of the browser, in a window, as a picture or as a film.
 
@@ -83,7 +82,7 @@ def view(
         source, known = state["sources"], ShotOptions.from_dict(state.get("options", {}))
     started = time.perf_counter()
     is_page = not (desktop or png or mp4)
-    door = PageDoor(host, port, no_browser, as_json)
+    door = PageDoor(host, port, no_browser)
     # Closing stops a live source and its threads, however the view ends.
     with contextlib.closing(door), contextlib.ExitStack() as opened:
         title = ", ".join(one if "://" in one else Path(one).name for one in source)
@@ -113,4 +112,4 @@ def view(
                 points = save_film(session, renderer, mp4, advance)
         figures = {"points": points, "backend": renderer.name}
         figures |= {"seconds": time.perf_counter() - started, **further}
-        report(figures, as_json, [path for path in (png, mp4) if path is not None])
+        report(figures, [path for path in (png, mp4) if path is not None])

@@ -399,7 +399,6 @@ class PageDoor:
     host: str  # an IP address of this computer, or ``"localhost"``
     port: int | None = None  # A free one by default
     no_browser: bool = False  # whether the page is not opened here
-    as_json: bool = False  # whether its address is reported as JSON
     _waiting: Served | None = None
 
     def open_waiting(self, title: str, words: str) -> None:
@@ -424,7 +423,7 @@ class PageDoor:
             stop_server(self._waiting[0])
 
     def _show_address(self, address: str) -> None:
-        report({"address": address}, self.as_json)
+        report({"address": address})
         sys.stdout.flush()  # a program that reads the address waits for it
         if not is_local(parse_host(self.host)):
             print(

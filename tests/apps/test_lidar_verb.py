@@ -118,7 +118,7 @@ def test_a_scene_is_listed_and_drawn(shell):
     assert 0 < first["range_sigma_m"] == first["confidence_m"] < 0.02
     assert Path("scene.png").read_bytes()[:4] == b"\x89PNG"
     shell.refuses(f"{SCENE} --fewest-points 9999")
-    assert "object 2" in shell(f"{SCENE} --reach-mm 60 --overwrite").out
+    assert "\n  2  1.6" in shell(f"{SCENE} --reach-mm 60 --overwrite").out
 
 
 @pytest.mark.parametrize("time_zero", [0.0, -2e-9])

@@ -97,7 +97,7 @@ class TestInfo:
         assert all(one["suits"] and one["memory_mib"] > 0 for one in found["methods"].values())
         people = shell("nlos info {confocal}")
         assert people.status == 0
-        assert "\nhybrid " in people.out
+        assert "\n  hybrid " in people.out
 
     def test_the_shortest_wavelength_is_just_not_undersampled(self, shell):
         chosen = shell.figures("nlos info {curved}")["wavelength_mm"]
