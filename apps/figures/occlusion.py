@@ -4,7 +4,7 @@ films of a flash as it travels and of a target that walks past behind.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -198,82 +198,76 @@ def draw_history(axes: Axes, experiment: Experiment) -> None:
     label_axes(axes, "sum of all measurements", "time after the flash (ps)", light)
 
 
-FRAME_MS, LAST_FRAME_MS = 120, 2500
+FLASH_RATE_HZ, WALK_RATE_HZ, LAST_REPEATS = 8, 6, 20  # the last picture of the flash stays
 DARK_THRESHOLD = 0.02  # of a return's brightest instant: the film passes over fainter ones
-WALK_STEP_MS = 180
 PANEL_LAYOUT = {"left": 0.02, "right": 0.98, "bottom": 0.16, "top": 0.8}
 
 
-class FlashFrame(NamedTuple):
-    """An instant of the flash."""
+class FilmFrame(NamedTuple):
+    """What a film shows at a time."""
 
-    time: float  # ps after the flash
     title: str
-    # of the middle view and of the recovery, from 0 to 1
-    pictures: tuple[AnyArray, AnyArray]
+    pictures: Sequence[AnyArray]  # from 0 to 1
+    time: float = 0.0  # ps after the flash
 
 
-class _Film:
-    """A GIF whose pictures are drawn into panels of one figure, in inches, beside other panels."""
+def _begin_film(width: float, height: float, columns: int, **layout: Any) -> tuple[Figure, Any]:
+    figure = make_figure(width, height)
+    figure.set_layout_engine("none")
+    return figure, figure.subplots(1, columns, gridspec_kw={**PANEL_LAYOUT, **layout})
 
-    def __init__(
-        self, size: tuple[float, float], names: Sequence[str], experiment: Experiment, **layout: Any
-    ) -> None:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        self.figure = make_figure(*size)
-        self.figure.set_layout_engine("none")
-        self._canvas = FigureCanvasAgg(self.figure)
-        columns, side = layout.pop("columns"), experiment.settings.side_px
-        self.panels = self.figure.subplots(1, columns, gridspec_kw={**PANEL_LAYOUT, **layout})
-        self._pictures, self._drawn = list[Any](), list[Any]()
-        for axes, name in zip(self.panels, names, strict=False):
-            blank, extent = 0 * experiment.truth, (0, side, side, 0)
-            self._pictures.append(draw_image(axes, blank, extent, vmin=0, vmax=1))
-            axes.set(xticks=[], yticks=[])
-            axes.set_title(name, fontsize=SMALL_FONT_PT + 2)
+def _save_film(
+    path: Path,
+    figure: Figure,
+    panels: Mapping[str, Axes],
+    frames: Sequence[FilmFrame],
+    rate_hz: int,
+    move: Callable[[float], object] = lambda _: None,
+) -> None:
+    """Write a GIF whose pictures are drawn into panels of a figure, by their titles; `move` is called
+    with each frame's time.
+    """
+    from matplotlib.animation import FuncAnimation, PillowWriter
 
-    def add(self, pictures: Sequence[AnyArray], title: str) -> None:
-        """Put pictures from 0 to 1 into their places, and draw the figure."""
-        from PIL import Image
+    drawn = []
+    for (name, axes), picture in zip(panels.items(), frames[0].pictures, strict=True):
+        drawn.append(draw_image(axes, picture, (0, 1, 1, 0), vmin=0, vmax=1))
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(name, fontsize=SMALL_FONT_PT + 2)
 
-        for shown, picture in zip(self._pictures, pictures, strict=True):
+    def show(frame: FilmFrame) -> None:
+        for shown, picture in zip(drawn, frame.pictures, strict=True):
             shown.set_data(picture)
-        self.figure.suptitle(title, fontsize=SMALL_FONT_PT + 4)
-        self._canvas.draw()
-        drawn = np.asarray(self._canvas.buffer_rgba())[..., :3]
-        self._drawn.append(Image.fromarray(drawn))
+        figure.suptitle(frame.title, fontsize=SMALL_FONT_PT + 4)
+        move(frame.time)
 
-    def save(self, path: Path, shown_ms: int, last_ms: int | None = None) -> None:
-        """Write it; without a time for the last picture it runs there and back again."""
-        first, *others = self._drawn if last_ms else [*self._drawn, *self._drawn[-2:0:-1]]
-        duration = [*[shown_ms] * len(others), last_ms or shown_ms]
-        with atomic_path(path) as temporary:
-            first.save(temporary, save_all=True, append_images=others, duration=duration, loop=0)
+    with atomic_path(path) as temporary:
+        FuncAnimation(figure, show, frames).save(temporary, PillowWriter(rate_hz))
 
 
 def save_flash_film(experiment: Experiment, path: Path) -> None:
     """Write a GIF: light reaches the occluder, then what is behind, each at its own brightness."""
-    film = _Film((8, 3.2), ("what one view sees", "ToF-CLIP"), experiment, columns=3)
-    time = film.panels[-1]
+    figure, (left, right, time) = _begin_film(8, 3.2, 3)
     draw_history(time, experiment)
     time.set_title("sum of all measurements", fontsize=SMALL_FONT_PT + 2)
     time.set_ylabel("")
     time.tick_params(axis="y", labelleft=False)
     cursor = time.axvline(experiment.time_axis.start / PICOSECOND, color=UNSEEN_COLOUR, lw=2)
-    for frame in _make_flash_frames(experiment):
-        cursor.set_xdata([frame.time, frame.time])
-        film.add(frame.pictures, frame.title)
-    film.save(path, FRAME_MS, LAST_FRAME_MS)
+    frames = _make_flash_frames(experiment)
+    frames += frames[-1:] * LAST_REPEATS
+    panels = {"what one view sees": left, "ToF-CLIP": right}
+    _save_film(
+        path, figure, panels, frames, FLASH_RATE_HZ, lambda now: cursor.set_xdata([now, now])
+    )
 
 
 def save_walk_film(
     experiment: Experiment, places: Sequence[float], path: Path, advance: Callable[[int], None]
 ) -> None:
-    """Write a GIF: the target walks past behind the occluder, from one place, m, to the next."""
+    """Write a GIF: the target walks past behind the occluder, from one place, m, to the next, and back."""
     names = ("one view, all its light", "one view, the second return", "ToF-CLIP", "truth")
-    film = _Film((9.4, 2.9), names, experiment, columns=4, bottom=0.02)
-    brightest = experiment.truth.max()
+    brightest, frames = experiment.truth.max(), []
     for number, across in enumerate(places):
         settings = replace(experiment.settings, seed=experiment.settings.seed + number)
         there = type(experiment)(experiment.scene.move_target(across), settings)
@@ -281,12 +275,14 @@ def save_walk_film(
         seen = everything * (brightest / everything.max())
         pictures = seen, there.single_view, there.separated.target, there.truth
         title = f"target {across / MILLIMETRE:+.0f} mm from the axis, {there.scene.behind / MILLIMETRE:.0f} mm behind"
-        film.add([one / brightest for one in pictures], title)
+        frames.append(FilmFrame(title, [one / brightest for one in pictures]))
         advance(1)
-    film.save(path, WALK_STEP_MS)
+    figure, panels = _begin_film(9.4, 2.9, 4, bottom=0.02)
+    there_and_back = [*frames, *frames[-2:0:-1]]
+    _save_film(path, figure, dict(zip(names, panels, strict=True)), there_and_back, WALK_RATE_HZ)
 
 
-def _make_flash_frames(experiment: Experiment) -> list[FlashFrame]:
+def _make_flash_frames(experiment: Experiment) -> list[FilmFrame]:
     """Every instant that is not dark; at last the whole of the second return."""
     separated, returns = experiment.separated, experiment.measurements.find_returns()
     parts = [separated.occluder, separated.target][: len(returns)]
@@ -300,11 +296,11 @@ def _make_flash_frames(experiment: Experiment) -> list[FlashFrame]:
         for instant in found.bins.start + np.flatnonzero(lit[found.bins] > DARK_THRESHOLD):
             pictures = middle[..., instant] / seen, lit[instant] * recovered / made
             title = f"{times[instant]:.0f} ps after the flash"
-            frames.append(FlashFrame(times[instant], title, pictures))
+            frames.append(FilmFrame(title, pictures, times[instant]))
     brightest = experiment.truth.max()
     behind, last = separated.plain, "nothing comes from behind the occluder"
     if separated.sees_target:
         behind = middle[..., returns[1].bins].sum(axis=-1)
         last = "all of the second return together"
     whole = behind / brightest, separated.target / brightest
-    return [*frames, FlashFrame(frames[-1].time, last, whole)]
+    return [*frames, FilmFrame(last, whole, frames[-1].time)]

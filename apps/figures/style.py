@@ -5,10 +5,9 @@ nothing.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from struct import Struct
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -222,59 +221,33 @@ def import_opencv() -> Any:
     return cv2
 
 
-BOX_HEADER, LONG_LENGTH = Struct(">I4s"), Struct(">Q")
-"""Length and kind of a box of an MP4 file, ISO/IEC 14496-12."""
+@contextmanager
+def open_film(out: Path, rate: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+    """Yield what appends a picture (rows, columns, 3), red first, to a film of `rate` a second; all are
+    of one size, and the file appears whole or not at all.
+    """
+    cv2, pictures, writer = import_opencv(), 0, None
+    with atomic_path(out) as temporary:
 
-
-class FilmWriter:
-    """A film that is being written. `rate`: pictures per second."""
-
-    def __init__(self, path: Path, rate: float) -> None:
-        self.path, self._rate, self._cv2 = path, rate, import_opencv()
-        self._writer: Any = None
-
-    def add(self, pixels: NDArray[np.uint8]) -> None:
-        """Append a picture (rows, columns, 3), red first; all are of one size."""
-        if self._writer is None:
-            code = self._cv2.VideoWriter_fourcc(*CODEC)
-            self._writer = self._cv2.VideoWriter(
-                str(self.path), code, self._rate, (pixels.shape[1], pixels.shape[0])
-            )
-            if not self._writer.isOpened():
+        def add(pixels: NDArray[np.uint8]) -> None:
+            nonlocal pictures, writer
+            if writer is None:
+                size, code = (pixels.shape[1], pixels.shape[0]), cv2.VideoWriter_fourcc(*CODEC)
+                writer = cv2.VideoWriter(str(temporary), code, rate, size)
+            if not writer.isOpened():
                 raise StorageError(
                     f"no film can be begun: the disk is full, or this machine's OpenCV has no {CODEC}: write pictures"
                 )
-        self._writer.write(pixels[..., ::-1])
+            writer.write(pixels[..., ::-1])
+            pictures += 1
 
-    def close(self) -> None:
-        if self._writer is not None:
-            self._writer.release()
-
-
-@contextmanager
-def open_film(out: Path, rate: float) -> Iterator[FilmWriter]:
-    """Yield a film to add pictures to, `rate` a second; the file appears whole or not at all."""
-    with atomic_path(out) as temporary:
-        film = FilmWriter(temporary, rate)
         try:
-            yield film
+            yield add
         finally:
-            film.close()
-        if not is_whole_film(temporary):  # OpenCV says nothing of what it could not write
+            if writer is not None:
+                writer.release()
+        # OpenCV says nothing of what it could not write: the last picture has to be there.
+        film = cv2.VideoCapture(str(temporary))
+        film.set(cv2.CAP_PROP_POS_FRAMES, pictures - 1)
+        if not film.read()[0]:
             raise StorageError(f"{out}: cannot be written: {DISK_IS_FULL}")
-
-
-def is_whole_film(path: Path) -> bool:
-    """Whether an MP4 file has all that it says: its index, which is written last, and every box."""
-    size, place, kinds = path.stat().st_size, 0, set()
-    with open(path, "rb") as file:
-        while place + BOX_HEADER.size <= size:
-            file.seek(place)
-            length, kind = BOX_HEADER.unpack(file.read(BOX_HEADER.size))
-            if length == 1:  # longer than 32 bits tell: the length follows
-                (length,) = LONG_LENGTH.unpack(file.read(LONG_LENGTH.size).ljust(8, b"\0"))
-            if length < BOX_HEADER.size:
-                return False
-            kinds.add(kind)
-            place += length
-    return place == size and b"moov" in kinds

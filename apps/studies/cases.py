@@ -9,7 +9,7 @@ number of steps just done, and returns an `Outcome`.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import groupby
@@ -46,6 +46,7 @@ CROSS_VALIDATED = "chosen by cross-validation with the first seed, without the t
 
 PAPER = Path(__file__).with_name("paper.csv")
 LABEL_SEPARATOR = " | "
+RECORDED = "data:"  # before the names of recorded light fields
 BORDER_PX = 12  # not scored: views leave the picture there
 CAMERA_NAMES = {
     "line": "CLIP-1D",
@@ -104,7 +105,7 @@ class Study:
     title: str
     note: str  # what differs from the paper
     seconds: float  # about what a seed costs on two cores
-    steps: int  # advances for each seed
+    steps: int  # advances for each seed; by default as many as it has cases
     work: Work
     weight: str = CROSS_VALIDATED  # how the prior's weight was chosen: the end of a sentence
     seeded: bool = True  # False: it has no random choices, more seeds change nothing
@@ -119,6 +120,7 @@ def study(name: str, *aliases: str, **others: Any) -> Callable[[Work], Work]:
     """Register the decorated work as a `Study`, whose other fields are given by name."""
 
     def register(work: Work) -> Work:
+        others.setdefault("steps", len(read_cases(name)))
         REGISTERED.append(Study(name, aliases, work=work, **others))
         return work
 
@@ -149,6 +151,11 @@ class Library:
         """Return what the reference view sees of an occlusion scene when its occluder is gone."""
         return render_view(remove_occluder(make_scene(name, self.array)), self.array, (0.0, 0.0))
 
+    def has_scene(self, name: str) -> bool:
+        """Whether a light field is rendered, or recorded and at hand."""
+        _, _, recorded = name.partition(RECORDED)
+        return not recorded or self.has_recording(f"lightfields/{recorded}.npz")
+
     def has_recording(self, name: str) -> bool:
         return self.data is not None and (self.data / name).is_file()
 
@@ -159,7 +166,7 @@ class Library:
 
     def _make_light_field(self, name: str) -> LightField:
         scene, _, variant = name.partition(":")
-        if scene == "data":
+        if name.startswith(RECORDED):
             return read_light_field(self.recording(f"lightfields/{variant}.npz"))
         if variant == "4x4":
             whole = self.light_field(scene)
@@ -278,23 +285,6 @@ def measure_case(case: Case, library: Library, seed: int) -> ClipMeasurement:
     noise = np.random.default_rng([seed, 2]).standard_normal(clean.values.size, np.float32)
     noisy = clean.values + np.float32(case.white_noise) * clean.values.std() * noise
     return corrupt_measurement(replace(clean, values=noisy), case.photons, case.bad_fraction)
-
-
-def lay_out_lines(
-    solved: Iterable[SolvedCase],
-    group: Callable[[Case], Any],
-    head: str,
-    title: Callable[[Case], str],
-) -> list[list[Panel]]:
-    """Lay out a line for each run of cases of one group: the truth, then what was recovered.
-    `head`: of the truth, filled in from the labels of a line's first case.
-    """
-    lines = []
-    for _, members in groupby(solved, key=lambda one: group(one.case)):
-        line = list(members)
-        true = Panel(f"{head.format(*line[0].case.labels)}\ntrue", line[0].truth)
-        lines.append([true, *(one.panel(title(one.case)) for one in line)])
-    return lines
 
 
 SHEAR_RANGE = (-1.4, 1.4)  # that surfaces are looked for in, for all scenes alike

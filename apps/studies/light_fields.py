@@ -94,7 +94,6 @@ def _tile_views(pictures: AnyArray) -> AnyArray:
     note="The paper's scenes were recorded; rendered words and letters at four depths stand for them.",
     weight=WEIGHT_NOTE,
     seconds=40,
-    steps=30,
     has_best=True,
 )
 def run_table3(library: Library, seeds: int, advance: Advance) -> Outcome:

@@ -51,7 +51,6 @@ FIXED_WEIGHT = (
     note="Rendered figures and words stand for the paper's. Its errors are against shift-and-add, so are ours; how far "
     "that itself is from the bare target is given in rows of their own.",
     seconds=15,
-    steps=16,
     has_best=True,
 )
 def run_black_occluders(library: Library, seeds: int, advance: Advance) -> Outcome:
@@ -82,7 +81,6 @@ def run_black_occluders(library: Library, seeds: int, advance: Advance) -> Outco
     "nothing of the occluder leaves the target dim where few views see it.",
     weight=FIXED_WEIGHT,
     seconds=50,
-    steps=16,
 )
 def run_flash_occlusion(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Flash, gate, and recover with and without the model of what the occluder hides."""

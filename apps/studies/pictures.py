@@ -5,21 +5,24 @@ sensors (Supp. Fig. 4), and which view gets which angle.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 
 from apps.studies.cases import (
     CAMERA_NAMES,
     CROSS_VALIDATED,
+    RECORDED,
     Advance,
+    Case,
     Library,
     Outcome,
     Panel,
     SolvedCase,
-    lay_out_lines,
+    Work,
     measure_case,
     read_cases,
     recover_stack,
@@ -45,7 +48,6 @@ def _make_outcome(
     title="Generalised flip test at SR = 0.5",
     note="The paper's scenes are not public: its scene 1 and 2 stand beside our own 'still-life' and 'blocks'.",
     seconds=40,
-    steps=48,
     has_best=True,
 )
 def run_flip_test(library: Library, seeds: int, advance: Advance) -> Outcome:
@@ -63,84 +65,86 @@ def run_flip_test(library: Library, seeds: int, advance: Advance) -> Outcome:
     return _make_outcome(("camera", "scene", "s", "edit"), solved, panels)
 
 
-def _lay_out_corrupted(solved: Sequence[SolvedCase]) -> list[list[Panel]]:
-    return lay_out_lines(
-        solved,
+def _solve_in_lines(
+    name: str,
+    columns: tuple[str, ...],
+    group: Callable[[Case], Any],
+    head: str,
+    title: Callable[[Case], str],
+) -> Work:
+    """Return a study of cases, recorded ones where they are at hand, with a line of pictures for each run
+    of rendered cases of one group: the truth, then what was recovered. `head`: of the truth, filled in
+    from the labels of a line's first case.
+    """
+
+    def work(library: Library, seeds: int, advance: Advance) -> Outcome:
+        cases = [case for case in read_cases(name) if library.has_scene(case.scene)]
+        solved, panels = solve_cases(cases, library, seeds, advance), []
+        rendered = (one for one in solved if not one.case.scene.startswith(RECORDED))
+        for _, members in groupby(rendered, key=lambda one: group(one.case)):
+            line = list(members)
+            true = Panel(f"{head.format(*line[0].case.labels)}\ntrue", line[0].truth)
+            panels.append([true, *(one.panel(title(one.case)) for one in line)])
+        return _make_outcome(columns, solved, panels)
+
+    return work
+
+
+def _solve_corrupted(name: str, *last_columns: str) -> Work:
+    return _solve_in_lines(
+        name,
+        ("camera", "scene", *last_columns),
         lambda case: (case.encoder, case.scene, case.data_term),
         "{0}, {1}",
         lambda case: ", ".join(case.labels[2:]),
     )
 
 
-@study(
+study(
     "table5",
     "fig12",
     title="Bad measurements at SR = 1",
     note="The paper does not say its data term; its figures stand beside squares, Huber's is ours. Scenes are our own.",
     seconds=50,
-    steps=24,
     has_best=True,
-)
-def run_invalid_measurements(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Set a fraction of the measurements to 0 or to the largest; recover with both data terms."""
-    solved = solve_cases(read_cases("table5"), library, seeds, advance)
-    columns = ("camera", "scene", "bad measurements", "data term")
-    return _make_outcome(columns, solved, _lay_out_corrupted(solved))
-
-
-@study(
+)(_solve_corrupted("table5", "bad measurements", "data term"))
+study(
     "table6",
     "fig13",
     title="Few photons at SR = 1",
     note="Scenes are our own.",
     seconds=15,
-    steps=16,
     has_best=True,
-)
-def run_few_photons(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Count photons; the largest measurement has the number given."""
-    solved = solve_cases(read_cases("table6"), library, seeds, advance)
-    return _make_outcome(("camera", "scene", "photons"), solved, _lay_out_corrupted(solved))
-
-
-@study(
+)(_solve_corrupted("table6", "photons"))
+study(
     "fig4",
     title="Sparse area sensors behind a diffuser, 2.5 % white noise",
     note="The paper shows pictures only, of flat scenes; these are posters of our own scenes.",
     seconds=20,
-    steps=15,
-)
-def run_area_sensors(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover scenes of three complexities from every n-th sensor pixel on either axis."""
-    solved = solve_cases(read_cases("fig4"), library, seeds, advance)
-    panels = lay_out_lines(
-        solved, lambda case: case.scene, "{0}", lambda case: f"pitch {case.labels[1]} px"
+)(
+    _solve_in_lines(
+        "fig4",
+        ("scene", "sparsity"),
+        lambda case: case.scene,
+        "{0}",
+        lambda case: f"pitch {case.labels[1]} px",
     )
-    return _make_outcome(("scene", "sparsity"), solved, panels)
-
-
-@study(
+)
+study(
     "dealing",
     title="Angles assigned to views at random, and evenly over the aperture",
     note="Beyond the paper, which deals at random.",
     seconds=25,
     steps=16,
-)
-def run_angle_assignment(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover with both ways of dealing; recorded light fields where they are at hand."""
-    cases = []
-    for case in read_cases("dealing"):
-        _, _, recorded = case.scene.partition("data:")
-        if not recorded or library.has_recording(f"lightfields/{recorded}.npz"):
-            cases.append(case)
-    solved = solve_cases(cases, library, seeds, advance)
-    panels = lay_out_lines(
-        (one for one in solved if not one.case.scene.startswith("data:")),
+)(
+    _solve_in_lines(
+        "dealing",
+        ("scene", "camera", "SR"),
         lambda case: (case.scene, case.encoder),
         "{0}, {1}",
         lambda case: f"SR = {case.labels[2]}",
     )
-    return _make_outcome(("scene", "camera", "SR"), solved, panels)
+)
 
 
 def _represent(name: str, library: Library, seeds: int, advance: Advance) -> Outcome:
@@ -191,6 +195,5 @@ for _name, _figure, _title, _more in (
         note=OWN_SCENE_NOTE + _more,
         weight=f"{CROSS_VALIDATED}; the depth maps take that of the first depth of their row",
         seconds=35,
-        steps=24,
         has_best=True,
     )(partial(_represent, _name))

@@ -418,9 +418,9 @@ def film(
         from apps.figures.style import open_film
         from nlos.picture import render_frames
 
-        with open_film(out, FRAME_RATE_HZ) as film:
+        with open_film(out, FRAME_RATE_HZ) as add:
             for picture in render_frames(video):
-                film.add(picture)
+                add(picture)
     save_settings(found, beside, "tofclip nlos film CAPTURE --settings THIS --out FILM")
     figures = {
         **{name: shown.get(name) for name in ("method", "wavelength_mm", "voxel_mm")},

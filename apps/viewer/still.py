@@ -277,12 +277,12 @@ def save_film(
     frames = choose_frames(session)
     if not frames:
         raise InputError(f"{session.source.title}: there is nothing to film")
-    with open_film(out, min(MAX_FRAME_RATE_HZ, session.source.rate)) as film:
+    with open_film(out, min(MAX_FRAME_RATE_HZ, session.source.rate)) as add:
         for frame in frames:
             # The clock stands still, so that the frame that is due is the one jumped to.
             session.clock.jump(frame)
             shown = session.frame_at(0.0)
-            film.add(figure.pixels(shown))
+            add(figure.pixels(shown))
             most = max(most, len(shown.cloud))
             advance(1)
     return most
