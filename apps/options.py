@@ -12,11 +12,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-import math
+import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from types import NoneType
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tomli_w
 import typer
@@ -139,7 +138,9 @@ DEVICE = opt(
 HELP_PANEL = "Settings (keys of the TOML file, there with _ for -)"
 METAVARS = {
     **dict.fromkeys(("letters",), "TEXT"),
-    **dict.fromkeys(("material", "method", "scan", "wall"), "NAME"),
+    **dict.fromkeys(("material", "method", "refine", "scan", "wall"), "NAME"),
+    **dict.fromkeys(("point_fraction", "prior_weight", "tolerance"), "SHARE"),
+    "methods": "A,B,...",
     "x": "M M",
     "y": "M M",
     "laser": "X Y",
@@ -147,29 +148,14 @@ METAVARS = {
     "mesh": "FILE",
     "flip": "AXIS",
     "set": "NAME=VALUE",
-    "tolerance": "SHARE",
     "falloff": "POWER",
     "signal_to_noise": "RATIO",
 }
-"""Of the libraries' settings; the others show their unit, or N for a number without one."""
+"""Of settings; the others show their unit, or N for a number without one."""
 
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
 Settings = TypeVar("Settings", bound="DataclassInstance")
 Verb = TypeVar("Verb", bound=Callable[..., None])
-
-
-def setting(
-    metavar: str | None,
-    meaning: str,
-    default: Any = None,
-    shown: str | None = None,
-    choices: Iterable[str] = (),
-    unit: str = "",
-    written: str | None = None,
-) -> Any:
-    """Declare a verb's own setting, of an SI `unit`, `written` in another on the command line."""
-    known = {"metavar": metavar, "help": meaning, "shown": shown, "choices": choices, "unit": unit}
-    return dataclasses.field(default=default, metadata={**known, "written": written or unit})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,14 +177,14 @@ class _Setting:
 
     def make_flag(self) -> inspect.Parameter:
         """Return the parameter of a verb; None stands for a flag that is not given."""
-        known, default = self.field.metadata, self.write(self.field.default)
+        known = self.field.metadata
         unit = known.get("written", known["unit"])
         usual = unit.upper() if unit in ("m", "s", *UNITS) else "N"
         is_flag = bool in (self.hint, *get_args(self.hint))
         option = typer.Option(
-            metavar=None if is_flag else known.get("metavar", METAVARS.get(self.field.name, usual)),
+            metavar=None if is_flag else METAVARS.get(self.field.name, usual),
             help=known["help"],
-            show_default=str(default) if known["shown"] is None else known["shown"],
+            show_default=known["shown"],
             autocompletion=make_completer(known.get("choices", ())),
             rich_help_panel=HELP_PANEL,
         )
@@ -287,41 +273,19 @@ def save_settings(settings: DataclassInstance, path: Path, heading: str) -> None
 
 
 def _read_file(kind: type[DataclassInstance], file: Path) -> dict[str, Any]:
+    from pydantic import ConfigDict, TypeAdapter, ValidationError
+
     found, known = read_toml(file, "settings"), _list_settings(kind)
-    for key in found:
+    strict = ConfigDict(strict=True, allow_inf_nan=False)
+    for key, value in found.items():
         if key not in known:
             hint = suggest_name(key, known)
             raise InputError(f"{file}: no setting is called '{key}'; {hint}")
-    return {
-        key: _convert_value(value, known[key].hint, f"{file}: {key}")
-        for key, value in found.items()
-    }
-
-
-def _convert_value(value: Any, hint: Any, where: str) -> Any:
-    """Return a value of the file as the type that the field asks for."""
-    wanted = next((one for one in get_args(hint) if NoneType in get_args(hint)), hint)
-    if get_origin(wanted) is tuple:
-        count = len(get_args(wanted))
-        if isinstance(value, list) and len(value) == count and all(map(_is_number, value)):
-            return tuple(map(float, value))
-        raise InputError(f"{where} must be a list of {count} finite numbers, got {value!r}")
-    if get_origin(wanted) is list:
-        if isinstance(value, list) and all(isinstance(one, str) for one in value):
-            return value
-        raise InputError(f"{where} must be a list of texts, got {value!r}")
-    if wanted is float and _is_number(value):
-        return float(value)
-    if type(value) is wanted and wanted is not float:
-        return value
-    names = {
-        float: "a finite number",
-        int: "a whole number",
-        str: "a text in quotes",
-        bool: "true or false",
-    }
-    raise InputError(f"{where} must be {names[wanted]}, got {value!r}")
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        try:
+            # Of JSON, like TOML, a pair is a list and a whole number one with a point as well.
+            text = json.dumps(value, default=str)
+            found[key] = TypeAdapter(known[key].hint, config=strict).validate_json(text)
+        except ValidationError as fault:
+            said = fault.errors()[0]["msg"].replace("Input", key)
+            raise InputError(f"{file}: {said}, got {value!r}") from fault
+    return found

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import math
 import os
 import re
 import sys
@@ -159,7 +158,7 @@ def report(
     `written`: files to name below the table; `note`: what has to be known about its figures;
     `json_only`: figures that are for programs.
     """
-    plain = to_json_value(figures)
+    plain = to_plain(figures)
     if PRINTS_JSON.get():
         print(json.dumps(plain, allow_nan=False))
         return
@@ -190,17 +189,14 @@ def report(
         print(f"wrote {path}")
 
 
-def to_json_value(value: Any) -> Any:
+def to_plain(figures: Mapping[str, Any]) -> dict[str, Any]:
     """Turn NumPy's numbers and arrays, paths and NaN into what JSON knows."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(name): to_json_value(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_json_value(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value
+    from pydantic_core import to_jsonable_python
+
+    plain: dict[str, Any] = to_jsonable_python(
+        dict(figures), inf_nan_mode="null", fallback=lambda one: one.tolist()
+    )
+    return plain
 
 
 def _find_compared(figures: Mapping[str, Any]) -> list[str]:

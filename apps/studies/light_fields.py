@@ -82,9 +82,9 @@ def _recover_light_fields(
 
 def _tile_views(pictures: AnyArray) -> AnyArray:
     """As many views as fill a square, in one picture, as they stand on the grid."""
-    side, (_, rows, columns) = isqrt(len(pictures)), pictures.shape
-    grid = pictures[: side * side].reshape(side, side, rows, columns)
-    return grid.swapaxes(1, 2).reshape(side * rows, side * columns)
+    from skimage.util import montage
+
+    return montage(pictures[: isqrt(len(pictures)) ** 2])
 
 
 @study(

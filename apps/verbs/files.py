@@ -14,7 +14,7 @@ from apps.report import (
     report,
     require_writable,
     summarise_list,
-    to_json_value,
+    to_plain,
 )
 from tofclip.errors import FileFormatError
 
@@ -61,7 +61,7 @@ def info(
 
     Example: tofclip info frames.h5
     """
-    found = to_json_value({"file": file, **describe_file(file)})
+    found = to_plain({"file": file, **describe_file(file)})
     if PRINTS_JSON.get():
         report(found)
     else:

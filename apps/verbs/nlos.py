@@ -25,7 +25,6 @@ from apps.options import (
     name_any,
     opt,
     save_settings,
-    setting,
     settings_to_dict,
     take_settings,
 )
@@ -64,7 +63,7 @@ from apps.verbs.nlos_imaging import (
     try_methods,
 )
 from apps.verbs.nlos_stream import film, stream
-from nlos.settings import METHODS, Settings
+from nlos.settings import METHODS, Settings, declare_setting
 from tofclip.errors import InputError, require_known
 from tofclip.files import PICTURE_SUFFIXES, identify_file, require_apart
 from tofclip.units import MILLIMETRE, PICOSECOND
@@ -101,30 +100,30 @@ app = make_group("Image the scene hidden around a corner.")
 class ReconstructSettings(Settings):
     """How a capture is imaged, refined and written."""
 
-    method: str | None = setting(
-        "NAME",
+    method: str | None = declare_setting(
+        "",
         f"One of {', '.join(METHODS.own)}.",
         shown="the quickest that suits the capture",
         choices=METHODS,
     )
-    point_fraction: float = setting(
-        "SHARE",
+    point_fraction: float = declare_setting(
+        "",
         "Voxels with this share of the brightest become points of .ply, .pcd, .csv, and the surface.",
         0.3,
     )
-    refine: str | None = setting(
-        "NAME",
+    refine: str | None = declare_setting(
+        "",
         "Iterate the image: photons by the statistics of counts; l1 for few bright things, tv for even surfaces.",
         shown="no",
         choices=REFINEMENTS,
     )
-    iterations: int | None = setting(
-        "N",
+    iterations: int | None = declare_setting(
+        "",
         "With --refine: steps at most; of l1 and tv each costs some four images.",
         shown=f"{ITERATIONS['l1']}; photons: {ITERATIONS[PHOTONS]}",
     )
-    prior_weight: float | None = setting(
-        "SHARE",
+    prior_weight: float | None = declare_setting(
+        "",
         "With --refine: weight of the prior, of that which leaves nothing; photons: of noise's standard deviation.",
         shown=f"{PRIOR_WEIGHTS['l1']}; photons: {PRIOR_WEIGHTS[PHOTONS]:g}",
     )

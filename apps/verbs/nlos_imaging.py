@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +21,6 @@ from apps.options import (
     find_key,
     opt,
     save_settings,
-    setting,
     settings_to_dict,
     take_settings,
 )
@@ -37,7 +35,14 @@ from apps.report import (
     say,
     with_past,
 )
-from nlos.settings import METHODS, METHODS_BY_SPEED, SceneSettings, Settings, list_taken
+from nlos.settings import (
+    METHODS,
+    METHODS_BY_SPEED,
+    SceneSettings,
+    Settings,
+    declare_setting,
+    list_taken,
+)
 from tofclip.errors import InputError, require_known
 from tofclip.files import PICTURE_SUFFIXES, require_apart
 
@@ -211,6 +216,7 @@ class MeasuredVolume:
 def measure_imaging(name: str, imaging: Method, capture: Capture, grid: Grid) -> MeasuredVolume:
     """Image the hidden scene, and measure time and memory, without loading the compiled loops."""
     from nlos import Grid
+    from tofclip.sequences.jobs import measure_peak_memory_bytes
 
     few = slice(WARM_UP_VOXELS)
     with show_activity(f"{name}: loading its loops"):
@@ -219,13 +225,14 @@ def measure_imaging(name: str, imaging: Method, capture: Capture, grid: Grid) ->
     started = time.perf_counter()
     volume = image_capture(name, imaging.plan(capture, grid), capture)
     seconds = time.perf_counter() - started
-    peak = _read_process_memory("VmHWM")
-    known = before is not None and peak is not None
-    return MeasuredVolume(volume, seconds, max(0, (peak or 0) - (before or 0)) if known else None)
+    taken = None if before is None else max(0, measure_peak_memory_bytes() - before)
+    return MeasuredVolume(volume, seconds, taken)
 
 
 def _reset_peak_memory() -> int | None:
     """Let the system forget the most memory ever taken; return what is taken now, bytes."""
+    from tofclip.sequences.jobs import measure_peak_memory_bytes
+
     # The C library keeps what was given back for later; what is taken from there again would not be
     # seen.
     with contextlib.suppress(AttributeError, OSError):
@@ -234,17 +241,7 @@ def _reset_peak_memory() -> int | None:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # Linux only: see proc(5)
     except OSError:
         return None
-    return _read_process_memory("VmRSS")
-
-
-def _read_process_memory(entry: str) -> int | None:
-    """Return an entry of Linux's account of this program's memory, bytes."""
-    try:
-        account = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
-    except OSError:
-        return None
-    found = re.search(rf"^{entry}:\s+(\d+)", account, re.M)
-    return None if found is None else int(found[1]) * 1024
+    return measure_peak_memory_bytes()
 
 
 WALL_SHAPE, WALL_POINTS = "cylinder", 64
@@ -265,8 +262,8 @@ BOX_M = ((-0.8, 0.8), (-0.5, 0.5), (0.72, 1.32))
 class CompareSettings(ImagingSettings):
     """What is compared on one capture."""
 
-    methods: str | None = setting(
-        "A,B,...",
+    methods: str | None = declare_setting(
+        "",
         f"Of {', '.join(METHODS.own)}; the first is the reference.",
         shown="all that suit the capture",
         choices=METHODS,

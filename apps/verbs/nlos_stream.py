@@ -23,7 +23,6 @@ from apps.options import (
     flag,
     opt,
     save_settings,
-    setting,
     settings_to_dict,
     take_settings,
 )
@@ -50,7 +49,7 @@ from apps.verbs.nlos_imaging import (
     show_settings,
 )
 from apps.verbs.recover import MAX_LATENCY_SAMPLES, compute_quantiles
-from nlos.settings import METHODS, Settings
+from nlos.settings import METHODS, Settings, declare_setting
 from tofclip.errors import InputError, TofclipError
 from tofclip.files import require_apart
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
@@ -79,14 +78,14 @@ virtual pulse.
 class StreamSettings(Settings):
     """How every capture of a stream is imaged."""
 
-    method: str | None = setting(
-        "NAME",
+    method: str | None = declare_setting(
+        "",
         f"One of {', '.join(METHODS.own)}.",
         shown="the quickest that suits the first capture",
         choices=METHODS,
     )
-    average: int = setting(
-        "N",
+    average: int = declare_setting(
+        "",
         "Captures averaged at the last depth, fewer nearer by: rsd, hybrid, backprojection.",
         1,
     )
@@ -340,19 +339,21 @@ def _run_with_page(made: VolumeStream, source: Path) -> dict[str, Any]:
 class FilmSettings(Settings):
     """What is filmed, and when."""
 
-    method: str | None = setting(
-        "NAME",
+    method: str | None = declare_setting(
+        "",
         f"{' or '.join(FILM_METHODS)}.",
         shown="the quickest that suits the capture",
         choices=FILM_METHODS,
     )
-    instants: int = setting("N", "How many.", 60)
-    first_ns: float | None = setting(
-        "NS", "First instant after the flash.", shown="before it meets the first voxel"
+    instants: int = declare_setting("", "How many.", 60)
+    first: float | None = declare_setting(
+        "s", "First instant after the flash.", written="ns", shown="before it meets the first voxel"
     )
-    last_ns: float | None = setting("NS", "Last instant.", shown="after it left the last voxel")
-    every_depth: bool = setting(
-        None, "Keep every depth, not only the brightest along every line of sight: .h5.", False
+    last: float | None = declare_setting(
+        "s", "Last instant.", written="ns", shown="after it left the last voxel"
+    )
+    every_depth: bool = declare_setting(
+        "", "Keep every depth, not only the brightest along every line of sight: .h5.", False
     )
 
 
@@ -396,13 +397,14 @@ def film(
     # The virtual pulse has a width, so that its flank arrives before its middle.
     nearest, farthest = find_leg_bounds(capture.lasers, grid)
     room = MARGIN_SIGMAS * method.pulse.sigma
-    ends = (plan / SPEED_OF_LIGHT / NANOSECOND for plan in (nearest - room, farthest + room))
-    given = (found.first_ns, found.last_ns)
+    ends = ((nearest - room) / SPEED_OF_LIGHT, (farthest + room) / SPEED_OF_LIGHT)
+    given = (found.first, found.last)
     first, last = (end if one is None else one for one, end in zip(given, ends, strict=True))
     if last < first:
-        raise InputError(f"a film must begin before it ends, got {first:.4g} to {last:.4g} ns")
-    found = replace(show_settings(found, [found.method or ""]), first_ns=first, last_ns=last)
-    times = NANOSECOND * np.linspace(first, last, found.instants)
+        said = f"{first / NANOSECOND:.4g} to {last / NANOSECOND:.4g} ns"
+        raise InputError(f"a film must begin before it ends, got {said}")
+    found = replace(show_settings(found, [found.method or ""]), first=first, last=last)
+    times = np.linspace(first, last, found.instants)
     take = imaging.video if found.every_depth else imaging.front_views
     with show_progress("filming", grid.size) as advance:
         video = take(capture, grid, times, advance)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -57,6 +58,8 @@ def view(
 
     Example: tofclip view frames.h5 --png scene.png
     """
+    from pydantic import TypeAdapter
+
     from apps.viewer.page import PageDoor
     from apps.viewer.session import Session, read_state, restore_state
     from apps.viewer.source import LayeredSource
@@ -75,11 +78,14 @@ def view(
     for out, suffixes in ((png, PICTURE_SUFFIXES), (mp4, (".mp4",))):
         if out is not None:
             require_writable(out, *suffixes, inputs=(*source, camera))
-    known, state = ShotOptions(camera, bin_width, time_zero, method), None
+    known, state = ShotOptions(camera and camera.resolve(), bin_width, time_zero, method), None
     if len(source) == 1 and source[0].endswith(".json"):
         state_file = Path(source[0])
         state = read_state(state_file)
-        source, known = state["sources"], ShotOptions.from_dict(state.get("options", {}))
+        source, known = (
+            state["sources"],
+            TypeAdapter(ShotOptions).validate_python(state.get("options", {})),
+        )
     started = time.perf_counter()
     is_page = not (desktop or png or mp4)
     door = PageDoor(host, port, no_browser)
@@ -94,7 +100,7 @@ def view(
             ]
             session = Session(found[0] if len(found) == 1 else LayeredSource(found))
             names = [one if "://" in one else str(Path(one).resolve()) for one in source]
-            session.opened = {"sources": names, "options": known.to_dict()}
+            session.opened = {"sources": names, "options": asdict(known)}
             if state is not None:
                 restore_state(session, state, state_file)
         if is_page:

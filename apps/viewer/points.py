@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from apps.viewer.look import format_length
 from apps.viewer.session import DisplayedFrame, Section
@@ -245,6 +246,7 @@ BOX_COLOUR, SCALE_BAR_COLOUR, CLIP_COLOUR = (139, 147, 163), (235, 238, 245), (2
 AXIS_COLOURS = ((229, 72, 77), (70, 167, 88), (62, 142, 208))
 # length of the axes, and of the clip box's handles, of half the box's diagonal
 AXES_FRACTION = 0.12
+Z_AXIS = (0.0, 0.0, 1.0)
 BAR_TURN = 0.03  # of its length that an end has to move for a scale bar to be drawn anew
 # quaternions, w x y z: upright, and half a turn after which the arrows at the high corner point
 # into the box
@@ -364,7 +366,10 @@ class SectionPlane:
     def show(self, point: AnyArray, normal: AnyArray, reach: float) -> None:
         """Draw the plane through a point; `reach`: half of the side of the square drawn, m."""
         self.hide()
-        look: Any = {"depth_test": False, "scale": 0.4 * reach, "wxyz": turn_to(normal)}
+        # a plane has two normals
+        turn, _ = Rotation.align_vectors(normal if normal[2] >= 0 else -normal, Z_AXIS)
+        turned = turn.as_quat(scalar_first=True)
+        look: Any = {"depth_test": False, "scale": 0.4 * reach, "wxyz": turned}
         self._handle = self._scene.add_transform_controls("/section", position=point, **look)
         corners = reach * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
@@ -380,14 +385,5 @@ class SectionPlane:
         """Return the slab about the plane, m thick; None where it is hidden."""
         if self._handle is None:
             return None
-        w, x, y, z = np.asarray(self._handle.wxyz, float).tolist()
-        # where the turn takes the z axis
-        normal = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
-        return Section(normal, float(np.dot(normal, self._handle.position)), thickness)
-
-
-def turn_to(normal: AnyArray) -> tuple[float, float, float, float]:
-    """Return the quaternion w, x, y, z that turns the z axis to a direction of length 1."""
-    x, y, z = normal if normal[2] >= 0 else -normal  # a plane has two normals
-    length = float(np.sqrt(2 * (1 + z)))
-    return length / 2, -y / length, x / length, 0.0
+        x, y, z = Rotation.from_quat(self._handle.wxyz, scalar_first=True).apply(Z_AXIS).tolist()
+        return Section((x, y, z), float(np.dot((x, y, z), self._handle.position)), thickness)

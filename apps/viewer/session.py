@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import TypeAdapter
 
 from apps.viewer.look import (
     QUANTITIES,
@@ -277,7 +278,7 @@ def write_state(session: Session, viewpoint: Viewpoint) -> str:
         "point_size_m": session.point_size,
         "viewpoint": [eye, target, viewpoint.field_of_view],
     }
-    return json.dumps(state, indent=1)
+    return json.dumps(state, indent=1, default=str)
 
 
 def read_state(path: Path) -> dict[str, Any]:
@@ -302,11 +303,8 @@ def restore_state(session: Session, state: dict[str, Any], path: Path) -> None:
     try:
         for setting, value in zip(session.source.settings, state["settings"], strict=True):
             setting.value = value
-        colouring, filters = state["colouring"], state["filters"]
-        limits, section = colouring["limits"], filters["section"]
-        session.colouring = Colouring(**{**colouring, "limits": limits and tuple(limits)})
-        kept = {name: tuple(one) for name, one in filters["limits"].items()}
-        session.filters = Filters(kept, section and Section(**section))
+        session.colouring = TypeAdapter(Colouring).validate_python(state["colouring"])
+        session.filters = TypeAdapter(Filters).validate_python(state["filters"])
         session.point_size = state["point_size_m"]
         eye, target, field_of_view = state["viewpoint"]
         session.viewpoint = Viewpoint(np.array(eye), np.array(target), field_of_view)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,14 +70,6 @@ class ShotOptions:
     # of `tofclip.plugins.METHODS`, ``"surfaces"`` for a single shot only. By default some iterations of
     # ``"l1"``, and frames as they were recovered
     method: str | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        return {**asdict(self), "camera": self.camera and str(self.camera.resolve())}
-
-    @classmethod
-    def from_dict(cls, known: dict[str, Any]) -> ShotOptions:
-        given: dict[str, Any] = {one.name: known.get(one.name) for one in fields(cls)}
-        return cls(**{**given, "camera": given["camera"] and Path(given["camera"])})
 
 
 def open_source(

@@ -125,8 +125,7 @@ def add_to_plotter(plotter: Any, shown: DisplayedFrame, point_px: int) -> None:
     plotter.set_background([value / 255 for value in BACKGROUND])
     plotter.remove_actor("shown", render=False)
     if shown.surface is not None:
-        faces = np.column_stack([np.full(len(shown.surface.faces), 3), shown.surface.faces])
-        mesh = pyvista.PolyData(shown.surface.vertices, faces.ravel())
+        mesh = pyvista.PolyData.from_regular_faces(shown.surface.vertices, shown.surface.faces)
         plotter.add_mesh(mesh, color="#d8d2c4", name="shown", specular=0.3)
     elif len(shown.cloud):
         points = pyvista.PolyData(shown.cloud.xyz)
