@@ -6,14 +6,21 @@ design`: what an instrument that is not built yet will see.
 from __future__ import annotations
 
 import statistics
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apps.options import PICTURE_FORMATS, PREVIEW, SEED, arg, opt
 from apps.progress import show_activity, show_progress
 from apps.report import choose_preview, make_folder, report, require_writable
-from apps.verbs.photons import AXES, FIELD_OF_VIEW, FOCAL_LENGTH, choose_camera, require_view
+from apps.verbs.photons import (
+    AXES,
+    FIELD_OF_VIEW,
+    FOCAL_LENGTH,
+    choose_camera,
+    read_any_photons,
+    require_view,
+)
 from tofclip.errors import FileFormatError, InputError
 from tofclip.files import PICTURE_SUFFIXES
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
@@ -21,9 +28,7 @@ from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 if TYPE_CHECKING:
     from tofclip.camera import Camera
     from tofclip.designs import Design, DesignReport
-    from tofclip.lidar import Pulse
     from tofclip.lidar.range_calibration import RangeFit, TargetShot
-    from tofclip.shots import Frames
 
 
 def calibrate(
@@ -156,7 +161,8 @@ def calibrate_range(
     from apps.figures.instrument import make_range_calibration_figure
     from tofclip.camera import Camera
     from tofclip.lidar import Pulse
-    from tofclip.lidar.range_calibration import fit_range_calibration
+    from tofclip.lidar.photons import estimate_pixels
+    from tofclip.lidar.range_calibration import TargetShot, fit_range_calibration
     from tofclip.notebook import save_figure
 
     preview = choose_preview(out, preview, (*shots, camera))
@@ -166,18 +172,25 @@ def calibrate_range(
     if any(map(math.isnan, reflectance_percent or [])):
         raise InputError("--reflectance-percent must be a positive percentage, got nan")
     percents = _one_each(reflectance_percent or [math.nan], len(shots), "--reflectance-percent")
-    reader = _ShotReader(
-        None if camera is None else Camera.load(camera),
-        method,
-        bin_width,
-        None if pulse_fwhm is None else Pulse.gaussian(pulse_fwhm),
-        axes,
-        (focal_length_px, field_of_view_deg),
-    )
+    if not all(0 < distance < math.inf for distance in distances):
+        raise InputError(f"--target-m: a distance must be a positive length, got {distances}")
+    known = None if camera is None else Camera.load(camera)
+    pulse = None if pulse_fwhm is None else Pulse.gaussian(pulse_fwhm)
     seen = []
     with show_progress("looking at the target", len(shots)) as advance:
         for shot, distance, percent in zip(shots, distances, percents, strict=True):
-            one = replace(reader.read(shot, distance), reflectance_percent=percent)
+            one = _read_shot(shot, distance, known, method, bin_width)
+            if one is None:
+                image, own_pulse, first_time = read_any_photons(shot, bin_width, axes)
+                found = estimate_pixels(image, pulse or own_pulse)
+                view = (focal_length_px, field_of_view_deg, found.pulse.fwhm)
+                seen_by = choose_camera(known, image.image_shape, *view)
+                # Ranges count from the first bin, as time zero will.
+                from_start = seen_by.replace(time_zero=0.0, range_calibration=None)
+                returns = found.calibrate(from_start, first_time).to_returns(from_start)
+                record = (first_time, first_time + (image.bins - 1) * image.bin_width)
+                one = TargetShot(returns, distance, record, shot)
+            one = replace(one, reflectance_percent=percent)
             if region is not None:
                 (top, bottom, left, right), y, x = region, one.returns.y, one.returns.x
                 rows, columns = one.returns.camera.image_shape
@@ -187,10 +200,10 @@ def calibrate_range(
                 one = one.cut((y >= top) & (y < bottom) & (x >= left) & (x < right))
             seen.append(one)
             advance(1)
-    found = fit_range_calibration(seen, walk=walk)
-    found.camera.save(out)
-    save_figure(make_range_calibration_figure(found, distances), preview)
-    report(_list_figures(found, len(shots)), [out, preview])
+    fit = fit_range_calibration(seen, walk=walk)
+    fit.camera.save(out)
+    save_figure(make_range_calibration_figure(fit, distances), preview)
+    report(_list_figures(fit, len(shots)), [out, preview])
 
 
 def _one_each(values: list[float], shots: int, option: str) -> list[float]:
@@ -202,58 +215,35 @@ def _one_each(values: list[float], shots: int, option: str) -> list[float]:
     return values * shots if len(values) == 1 else values
 
 
-@dataclass(frozen=True)
-class _ShotReader:
-    """How shots of the target are read: frames, streak images, or counted photons."""
+def _read_shot(
+    shot: str, distance: float, camera: Camera | None, method: str, bin_width: float | None
+) -> TargetShot | None:
+    """Find the returns of a shot of a target at a distance, m, as they were measured, in frames or a
+    streak image; None of counted photons.
+    """
+    from devices.transients import find_address
+    from tofclip.files import translate_read_errors
+    from tofclip.io import read_streak
+    from tofclip.lidar import depth
+    from tofclip.lidar.photons.files import PHOTON_SUFFIXES
+    from tofclip.lidar.range_calibration import TargetShot
+    from tofclip.recovery import make_method, open_shot, parse_focus, plan_recovery
+    from tofclip.shots import Frames
+    from tofclip.storage import HDF5_SIGNATURE, read_outline
 
-    camera: Camera | None
-    method: str
-    bin_width: float | None  # s
-    pulse: Pulse | None
-    axes: str | None
-    view: tuple[float | None, float]  # focal length, px, and field of view, degrees, of a pinhole
-
-    def read(self, shot: str, distance: float) -> TargetShot:
-        """Find the returns of a shot of a target at a distance, m, as they were measured."""
-        from tofclip.lidar import depth
-        from tofclip.lidar.range_calibration import TargetShot
-
-        if not 0 < distance < float("inf"):
-            raise InputError(f"--target-m: a distance must be a positive length, got {distance}")
-        frames = self._load_frames(shot, distance)
-        if frames is None:
-            return self._read_photons(shot, distance)
-        if frames.returns is not None and frames.camera.range_calibration is not None:
-            raise InputError(
-                f"{shot}: its returns are corrected already: recover it with a camera without a "
-                "range calibration"
-            )
-        bare = frames.camera.replace(range_calibration=None)
-        returns = depth(frames, bare if frames.returns is None else None)
-        record = frames.times[0], frames.times[-1]
-        return TargetShot(replace(returns, camera=bare), distance, record, shot)
-
-    def _load_frames(self, shot: str, distance: float) -> Frames | None:
-        """Load frames or recover them; None of counted photons."""
-        from devices.transients import find_address
-        from tofclip.files import translate_read_errors
-        from tofclip.io import read_streak
-        from tofclip.lidar.photons.files import PHOTON_SUFFIXES
-        from tofclip.recovery import make_method, open_shot, parse_focus, plan_recovery
-        from tofclip.shots import Frames
-        from tofclip.storage import HDF5_SIGNATURE, read_outline
-
-        if "://" in shot or Path(shot).suffix.lower() in PHOTON_SUFFIXES or find_address(shot):
-            return None
-        with translate_read_errors(shot), open(shot, "rb") as file:
-            ours = file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
-        try:
-            if ours and read_outline(shot).kind == Frames.RECORD_KIND:
-                return Frames.load(shot)
-            streak = read_streak(shot, self.bin_width)
-        except FileFormatError:
-            return None
-        known = self.camera or streak.camera
+    if "://" in shot or Path(shot).suffix.lower() in PHOTON_SUFFIXES or find_address(shot):
+        return None
+    with translate_read_errors(shot), open(shot, "rb") as file:
+        ours = file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
+    try:
+        is_frames = ours and read_outline(shot).kind == Frames.RECORD_KIND
+        streak = None if is_frames else read_streak(shot, bin_width)
+    except FileFormatError:
+        return None
+    if streak is None:
+        frames = Frames.load(shot)
+    else:
+        known = camera or streak.camera
         if known is None:
             raise InputError(f"{streak.source} carries no camera: give one (`camera`)")
         known = known.replace(range_calibration=None)
@@ -262,21 +252,16 @@ class _ShotReader:
         opened = open_shot(streak, known, float(2 * first - last))
         # The target's distance is known, and so is where the views see it.
         focus = parse_focus(f"fixed:{float(known.shear_at(distance)):.9g}")
-        return plan_recovery(opened, make_method(self.method), focus, "cpu").run()
-
-    def _read_photons(self, shot: str, distance: float) -> TargetShot:
-        from apps.verbs.photons import read_any_photons
-        from tofclip.lidar.photons import estimate_pixels
-        from tofclip.lidar.range_calibration import TargetShot
-
-        image, pulse, first_time = read_any_photons(shot, self.bin_width, self.axes)
-        found = estimate_pixels(image, self.pulse or pulse)
-        seen_by = choose_camera(self.camera, image.image_shape, *self.view, found.pulse.fwhm)
-        # Ranges count from the first bin, as time zero will.
-        from_start = seen_by.replace(time_zero=0.0, range_calibration=None)
-        returns = found.calibrate(from_start, first_time).to_returns(from_start)
-        last_time = first_time + (image.bins - 1) * image.bin_width
-        return TargetShot(returns, distance, (first_time, last_time), shot)
+        frames = plan_recovery(opened, make_method(method), focus, "cpu").run()
+    if frames.returns is not None and frames.camera.range_calibration is not None:
+        raise InputError(
+            f"{shot}: its returns are corrected already: recover it with a camera without a "
+            "range calibration"
+        )
+    bare = frames.camera.replace(range_calibration=None)
+    returns = depth(frames, bare if frames.returns is None else None)
+    record = frames.times[0], frames.times[-1]
+    return TargetShot(replace(returns, camera=bare), distance, record, shot)
 
 
 def _list_figures(found: RangeFit, shots: int) -> dict[str, Any]:

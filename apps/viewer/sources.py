@@ -282,18 +282,15 @@ class RecoveredSource(Source):
             data_term=data_term,
         )
 
-    def recover_frames(self, number: int) -> Frames:
-        return self.recover(number)
+    def recover_frames(self, number: int, part: slice = ALL_FRAMES) -> Frames:
+        return self.recover(number, part=part)
 
     def waveform(
         self, number: int, pixel: tuple[int, int], time: float, layer: int = 1
     ) -> FloatArray:
         row, column = pixel
-        frames = self.recover_near(number, find_near(self.measured_times, time))
+        frames = self.recover_frames(number, find_near(self.measured_times, time))
         return np.stack([frames.times, frames.values[:, row, column]])
-
-    def recover_near(self, number: int, near: slice) -> Frames:
-        return self.recover(number, part=near)
 
 
 def find_near(times: FloatArray, time: float) -> slice:
@@ -376,11 +373,8 @@ class TransientSource(RecoveredSource):
     def measure(self, number: int) -> Measured:
         return self._measured
 
-    def recover_frames(self, number: int) -> Frames:
-        return self.frames
-
-    def recover_near(self, number: int, near: slice) -> Frames:
-        return self.frames[near]
+    def recover_frames(self, number: int, part: slice = ALL_FRAMES) -> Frames:
+        return self.frames[part]
 
     def pictures(self, number: int) -> Mapping[str, Picture]:
         gate = self.find_gate(number)

@@ -3,6 +3,7 @@
 import os
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -116,16 +117,17 @@ def test_without_opencv_there_is_no_mp4(shell, monkeypatch):
 def test_a_film_that_the_disk_cut_short_is_no_result(shell, monkeypatch, part):
     cv2 = pytest.importorskip("cv2")
 
-    class FullDisk(cv2.VideoWriter):
-        def __init__(self, path, *how):
-            self.path = path
-            super().__init__(path, *how)
+    opened = cv2.VideoWriter
 
-        def release(self):
-            super().release()
-            os.truncate(self.path, int(part * os.path.getsize(self.path)))
+    def open_on_full_disk(path, *how):
+        def release():
+            writer.release()
+            os.truncate(path, int(part * os.path.getsize(path)))
 
-    monkeypatch.setattr(cv2, "VideoWriter", FullDisk)
+        writer = opened(path, *how)
+        return SimpleNamespace(write=writer.write, isOpened=writer.isOpened, release=release)
+
+    monkeypatch.setattr(cv2, "VideoWriter", open_on_full_disk)
     said = "cut.mp4: cannot be written: the disk is full"
     shell.refuses("nlos film {curved} --voxel-mm 40 --instants 8 --out cut.mp4", said)
     assert not list(Path().iterdir())

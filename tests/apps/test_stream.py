@@ -5,7 +5,7 @@ software, stacks, folders.
 import os
 from dataclasses import replace
 from pathlib import Path
-from time import monotonic, sleep
+from time import monotonic, sleep, time_ns
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from devices.emulation.scenes import EmulatedLight, simulate_line_light
 from tofclip.camera import Camera, SkewSweep
 from tofclip.io.streaks import save_stack
 from tofclip.lidar import PointCloud, depth
+from tofclip.lidar.ros import MESSAGE_TYPE, read_bag
 from tofclip.sequences.ranger import SurfacePipeline
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Frames, Streak
@@ -204,3 +205,32 @@ def test_a_folder_without_a_shot_that_can_be_read_is_refused(shell):
     for name in ("a.tif", "b.tif"):
         Path(name).write_bytes(b"II*\0")
     shell.refuses("stream .", "a.tif")
+
+
+def test_histograms_of_a_picture_are_streamed_recorded_and_looked_at(shell):
+    """An emulated kit of 8 x 8 zones, of which every fifth picture is lost on its way."""
+    address = "'sim+tmf8828://?seed=1&rate=20&lost=5'"
+    assert shell(f"record {address} --out run.h5 --seconds 1").status == 0
+    verified = shell.figures("devices verify run.h5")
+    played = shell.figures("stream run.h5 --out played")
+    assert played["method"] == "photons"
+    assert played["acquired"] == played["delivered"] == verified["records"]
+    assert {len(PointCloud.load(one)) for one in Path("played").iterdir()} == {64}
+    assert shell.figures("view run.h5 --png view.png")["points"] == 64
+    shell.figures("lidar photons run.h5 --out range.npz")
+    assert shell.figures("view range.npz --png range.png")["points"] == 64
+    before = time_ns()
+    live = shell.figures(
+        f"stream {address} --shots 3 --out live.mcap --topic /kit/points --frame-id kit"
+    )
+    assert live["dropped"] == live["dropped_device"] + live["dropped_host"]
+    assert live["acquired"] == live["delivered"] + live["dropped"] + live["failed"]
+    stamps = [one.stamp_ns for one in read_bag("live.mcap")]
+    assert before < stamps[0] < stamps[1] < stamps[2] < time_ns()
+    held = shell.figures("info live.mcap")
+    assert held["topics"] == {"/kit/points": {"type": MESSAGE_TYPE, "messages": 3}}
+    assert held["seconds"] == pytest.approx((stamps[2] - stamps[0]) / 1e9, abs=1e-6)
+    assert shell.figures("lidar bag live.mcap --out back --topic /kit/points")["clouds"] == 3
+    assert shell.figures("lidar bag back/cloud_000002.ply --out alone.mcap")["points"] == 64
+    for verb in ("stream run.h5", "view run.h5 --png tv.png"):
+        assert "leave out the method" in shell(f"{verb} --method tv").err
