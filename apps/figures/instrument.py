@@ -5,10 +5,12 @@ built: what its views see, what they leave undetermined, and how well it will me
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from apps.figures.occlusion import draw_region
 from apps.figures.style import (
@@ -22,20 +24,11 @@ from apps.figures.style import (
     make_figure,
 )
 from tofclip.arrays import AnyArray
-from tofclip.designs import find_inactive_region, list_footprints
+from tofclip.camera.focus_pictures import FocusCalibration
+from tofclip.designs import DesignReport, find_inactive_region, list_footprints
+from tofclip.lidar.range_calibration import RangeFit
 from tofclip.notebook import letter_panels
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from tofclip.camera.focus_pictures import FocusCalibration
-    from tofclip.designs import DesignReport
-    from tofclip.lidar.range_calibration import RangeFit
-
 
 ZOOM_HALF_WIDTH_PX = 20
 MARGIN_ROWS = 25

@@ -5,9 +5,12 @@ the room, what the wall shows, and images beside the truth.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
@@ -20,16 +23,10 @@ from apps.figures.style import (
     make_figure,
     outer_edges,
 )
+from apps.verbs.nlos_imaging import DemoRun
+from nlos import Capture, Volume
+from nlos.known_scenes import HiddenTruth
 from tofclip.notebook import letter_panels
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
-
-    from apps.verbs.nlos_imaging import DemoRun
-    from nlos import Capture, Volume
-    from nlos.known_scenes import HiddenTruth
 
 COLUMN_INCHES = 3.2
 TEXT_INCHES = 1.7

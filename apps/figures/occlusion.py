@@ -7,9 +7,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from apps.figures.style import (
     EMPTY_COLOUR,
@@ -20,19 +23,13 @@ from apps.figures.style import (
     label_axes,
     make_figure,
 )
+from apps.occlusion.experiment import Experiment, ProbeResult
+from tofclip.arrays import AnyArray
 from tofclip.files import atomic_path
 from tofclip.metrics import correlation_coefficient
 from tofclip.notebook import letter_panels
+from tofclip.occlusion import InactiveRegion
 from tofclip.units import MILLIMETRE, PICOSECOND
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from apps.occlusion.experiment import Experiment, ProbeResult
-    from tofclip.arrays import AnyArray
-    from tofclip.occlusion import InactiveRegion
-
 
 VIEW_COUNT = 7
 DRAWN_LENGTH_FACTOR = 2.2  # of the region, behind the occluder
@@ -228,8 +225,6 @@ def _save_film(
     """Write a GIF whose pictures are drawn into panels of a figure, by their titles; `move` is called
     with each frame's time.
     """
-    from matplotlib.animation import FuncAnimation, PillowWriter
-
     drawn = []
     for (name, axes), picture in zip(panels.items(), frames[0].pictures, strict=True):
         drawn.append(draw_image(axes, picture, (0, 1, 1, 0), vmin=0, vmax=1))

@@ -6,11 +6,17 @@ with its objects, from two sides and at single ranges.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks
 
 from apps.figures.style import (
     DEPTH_COLOURMAP,
@@ -28,21 +34,13 @@ from apps.figures.style import (
 )
 from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray
 from tofclip.camera import estimate_dark_level
+from tofclip.lidar import PointCloud, Returns
+from tofclip.lidar.cloud import DetectedObject
+from tofclip.lidar.photons import SurfaceImage
 from tofclip.notebook import letter_panels
+from tofclip.shots import Frames, Streak
+from tofclip.simulate import GroundTruth
 from tofclip.units import MILLIMETRE, NANOSECOND, SPEED_OF_LIGHT
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from tofclip.lidar import PointCloud, Returns
-    from tofclip.lidar.cloud import DetectedObject
-    from tofclip.lidar.photons import SurfaceImage
-    from tofclip.shots import Frames, Streak
-    from tofclip.simulate import GroundTruth
-
 
 PANEL_COLUMNS = 4
 MAX_MOMENTS = 3 * PANEL_COLUMNS
@@ -111,9 +109,6 @@ def choose_moments(frames: Frames) -> list[Moment]:
 
 
 def _find_peak_moments(energy: FloatArray) -> list[Moment]:
-    from scipy.ndimage import gaussian_filter1d
-    from scipy.signal import find_peaks
-
     # padded: the first and the last frame can be peaks
     smooth = np.pad(gaussian_filter1d(energy, 1.5), 1)
     prominence = MIN_PEAK_PROMINENCE * smooth.max()
@@ -319,8 +314,6 @@ def make_scene_figure(
 
 def _draw_cloud(space: Any, cloud: PointCloud) -> None:
     """The cloud from above and aside; the camera looks along the axis that goes back."""
-    from matplotlib.ticker import MaxNLocator
-
     x, y, z = cloud.xyz.T
     drawn = space.scatter(x, z, -y, c=cloud.range, cmap=DEPTH_COLOURMAP, s=1.5, linewidths=0)
     bar = space.figure.colorbar(drawn, ax=space, shrink=0.7, pad=0.08)

@@ -8,20 +8,20 @@ import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from numpy.typing import NDArray
+from PIL import Image
 
 from tofclip.arrays import AnyArray, FloatArray
 from tofclip.errors import MissingDependencyError, StorageError
 from tofclip.files import DISK_IS_FULL, atomic_path
 from tofclip.units import NANOSECOND
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
 
 BRIGHTNESS_COLOURMAP = "inferno"
 DEPTH_COLOURMAP = "viridis"
@@ -43,8 +43,6 @@ LABEL_ROOM_INCHES = (0.6, 0.12, 0.45, 0.3)
 
 def make_figure(width: float, height: float) -> Figure:
     """Make an empty figure, in inches; it draws with Agg, without a display or pyplot."""
-    from matplotlib.figure import Figure  # a third of a second that only a verb's pictures need
-
     return Figure(figsize=(width, height), dpi=DOTS_PER_INCH, layout="constrained")
 
 
@@ -79,8 +77,6 @@ def add_panels(
 
 def store_picture(picture: Path, place: Path) -> None:
     """Store a picture for a page, of a page's width and in `FEWER_COLOURS`."""
-    from PIL import Image
-
     drawn = picture.read_bytes()
 
     def compress(image: Image.Image) -> bytes:
@@ -188,8 +184,6 @@ def scale_brightness(picture: AnyArray, gamma: float = 1.0) -> dict[str, Any]:
     """How a picture is shown whose few brightest pixels do not darken the rest; with a `gamma` below
     1 far things stay visible beside near ones, and the colour scale says so.
     """
-    from matplotlib.colors import PowerNorm
-
     top = np.percentile(picture, WHITE_PERCENTILE) if picture.size else 0.0
     return {"norm": PowerNorm(gamma, 0, top if top > 0 else picture.max(initial=0) or 1.0)}
 

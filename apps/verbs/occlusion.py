@@ -41,14 +41,15 @@ def region(
     Example: tofclip occlusion region --baseline-mm 15 --width-mm 6 --distance-mm 50 --out
     region.png
     """
-    from apps.figures.occlusion import make_region_figure
-    from tofclip.notebook import save_figure
     from tofclip.occlusion import InactiveRegion
 
     if out is not None:
         require_writable(out, *PICTURE_SUFFIXES)
     found = InactiveRegion(baseline, width, distance)
     if out is not None:
+        from apps.figures.occlusion import make_region_figure
+        from tofclip.notebook import save_figure
+
         save_figure(make_region_figure(found), out)
     figures = {
         "inactive_length_m": found.length

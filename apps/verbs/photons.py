@@ -119,7 +119,6 @@ def photons(
     """
     import numpy as np
 
-    from apps.figures.shot import make_range_figure
     from tofclip.camera import Camera
     from tofclip.lidar import Pulse, point_cloud, save_depth
     from tofclip.lidar.photons import estimate_pixels, estimate_surface
@@ -177,6 +176,8 @@ def photons(
     if suffix == RANGE_IMAGE_SUFFIX:
         save_range_image(found, seen_by, out, returns)
     elif suffix in PICTURE_SUFFIXES:
+        from apps.figures.shot import make_range_figure
+
         save_figure(make_range_figure(found), out)
     elif suffix == DEPTH_SUFFIX:
         save_depth(found.to_returns(seen_by, past), out)
