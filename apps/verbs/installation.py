@@ -247,26 +247,19 @@ def demo(
     Example: tofclip demo --out demo-output
     """
     from apps.figures.shot import make_demo_figure
+    from tofclip import simulate
     from tofclip.lidar import depth, point_cloud
     from tofclip.metrics import nmse
     from tofclip.notebook import save_figure
     from tofclip.recovery import open_shot, plan_recovery
-    from tofclip.simulate import (
-        make_default_instrument,
-        make_default_scene,
-        make_nominal_camera,
-        render_true_frames,
-        score_returns,
-        simulate_shot,
-    )
 
     started = time.perf_counter()
     make_folder(out)
     written = [out / name for name in ("streak.h5", "frames.h5", "cloud.ply", "preview.png")]
     require_new(*written)
-    scene, instrument = make_default_scene(), make_default_instrument()
-    shot = simulate_shot(scene, instrument, seed)
-    streak = replace(shot.streak, camera=make_nominal_camera(shot.camera))
+    scene, instrument = simulate.make_default_scene(), simulate.make_default_instrument()
+    shot = simulate.simulate_shot(scene, instrument, seed)
+    streak = replace(shot.streak, camera=simulate.make_nominal_camera(shot.camera))
     surfaces = plan_recovery(open_shot(streak), "surfaces")
     with show_progress("recovering", surfaces.work) as advance:
         frames = surfaces.run(advance)
@@ -284,10 +277,10 @@ def demo(
     save_figure(figure, written[3])
     # Light of all instants together: the picture a camera without time of flight would take.
     picture = frames.values.sum(axis=0)
-    truth = render_true_frames(scene, instrument, shot.exposure).values.sum(axis=0)
+    truth = simulate.render_true_frames(scene, instrument, shot.exposure).values.sum(axis=0)
     figures = {
         "seed": seed,
-        **score_returns(returns, shot.truth),
+        **simulate.score_returns(returns, shot.truth),
         "image_nmse": nmse(picture, truth),
         "image_nmse_inner": nmse(picture, truth, BORDER_PX),
         "relative_residual": frames.figures["relative_residual"],

@@ -292,13 +292,8 @@ def compare(
     Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
     """
     from apps.figures.nlos import make_comparison_figure
+    from nlos import known_scenes
     from nlos.io import read_capture
-    from nlos.known_scenes import (
-        HiddenTruth,
-        compare_with_truth,
-        correlate_views,
-        measure_sharpness,
-    )
     from tofclip.notebook import save_figure
 
     written = [out, name_beside(out, ".toml")]
@@ -310,7 +305,7 @@ def compare(
     if volumes is not None:
         require_apart([volumes, *(volumes / f"{name}.h5" for name in METHODS)], [source, settings])
         make_folder(volumes)
-    capture, truth = read_capture(source), HiddenTruth.find(source)
+    capture, truth = read_capture(source), known_scenes.HiddenTruth.find(source)
     # The voxels are those of the virtual pulse, for all methods alike.
     prepared = prepare_imaging(capture, wanted)
     ours, grid = prepared.capture, prepared.grid
@@ -326,9 +321,11 @@ def compare(
         runs[name] = run = measure_imaging(name, method, ours, grid)
         figures[name] = {
             **run.costs,
-            "correlation": correlate_views(run.volume, next(iter(runs.values())).volume),
-            "sharpness": measure_sharpness(run.volume),
-            **({} if truth is None else compare_with_truth(run.volume, truth)),
+            "correlation": known_scenes.correlate_views(
+                run.volume, next(iter(runs.values())).volume
+            ),
+            "sharpness": known_scenes.measure_sharpness(run.volume),
+            **({} if truth is None else known_scenes.compare_with_truth(run.volume, truth)),
         }
     images = {name: run.volume for name, run in runs.items()}
     save_figure(make_comparison_figure(images, figures, truth), out)

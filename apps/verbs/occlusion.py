@@ -114,16 +114,7 @@ def demo(
     Example: tofclip occlusion demo --live --scene bush
     """
     from apps.figures.occlusion import make_occlusion_figure, save_flash_film, save_walk_film
-    from apps.occlusion.experiment import (
-        DEFAULT_PHOTONS,
-        DISTANCE_FACTORS,
-        WALK_PLACES_M,
-        Experiment,
-        ExperimentSettings,
-        make_occlusion_scene,
-        make_walking_scene,
-        probe_target,
-    )
+    from apps.occlusion import experiment as trial
     from tofclip.metrics import correlation_coefficient, nmse
     from tofclip.notebook import save_figure
 
@@ -132,12 +123,14 @@ def demo(
         raise InputError("--live writes nothing; leave --out out")
     if (recording is not None or camera is not None) and not live:
         raise InputError("--recording and --camera are for --live")
-    require_known("encoder", encoder, DEFAULT_PHOTONS)
+    require_known("encoder", encoder, trial.DEFAULT_PHOTONS)
     # A single pixel sums a whole picture and so needs more photons.
-    usual = DEFAULT_PHOTONS[encoder] if photons is None else photons
+    usual = trial.DEFAULT_PHOTONS[encoder] if photons is None else photons
     side = side_px or (LIVE_SIDE_PX if live else SIDE_PX)
-    rays = 1 if live else ExperimentSettings.samples
-    settings = ExperimentSettings(side, encoder, sampling_ratio, illumination, usual, seed, rays)
+    rays = 1 if live else trial.ExperimentSettings.samples
+    settings = trial.ExperimentSettings(
+        side, encoder, sampling_ratio, illumination, usual, seed, rays
+    )
     if live:
         from apps.occlusion.live import GatedSource, WalkSource
         from apps.viewer.page import LOOPBACK, PageDoor
@@ -147,7 +140,7 @@ def demo(
         with show_activity("looking past"):
             known = ShotOptions(camera, time_zero=time_zero)
             source = (
-                WalkSource(make_walking_scene(scene), settings)
+                WalkSource(trial.make_walking_scene(scene), settings)
                 if recording is None
                 else GatedSource(open_source(recording, known))
             )
@@ -156,27 +149,27 @@ def demo(
         return
     if out is None:
         raise InputError("give --out DIR, or --live for a page")
-    experiment = Experiment(make_occlusion_scene(scene), settings)
+    experiment = trial.Experiment(trial.make_occlusion_scene(scene), settings)
     # Before anything is written: this refuses settings of which no camera can be built.
     measurement_count = experiment.rig.camera.measurements
     make_folder(out)
     require_new(out / "occlusion.png")
     seen, probes = experiment.scene, []
     # Small targets inside the inactive region and beyond; without a bound nothing is beyond.
-    factors = DISTANCE_FACTORS if seen.region.is_bounded else ()
+    factors = trial.DISTANCE_FACTORS if seen.region.is_bounded else ()
     with show_progress("looking past", 1 + len(factors)) as advance:
         separated = experiment.separated
         advance(1)
         for factor in factors:
-            probes.append(probe_target(seen.occluder, seen.region, factor, seed))
+            probes.append(trial.probe_target(seen.occluder, seen.region, factor, seed))
             advance(1)
     written = [out / "occlusion.png", out / "occlusion.gif"]
     save_figure(make_occlusion_figure(experiment, probes), written[0])
     save_flash_film(experiment, written[1])
     if moving:
         written.append(out / "occlusion_moving.gif")
-        with show_progress("walking", len(WALK_PLACES_M)) as advance:
-            save_walk_film(experiment, WALK_PLACES_M, written[2], advance)
+        with show_progress("walking", len(trial.WALK_PLACES_M)) as advance:
+            save_walk_film(experiment, trial.WALK_PLACES_M, written[2], advance)
     # Correlations are with the target as seen with its occluder taken away.
     truth = experiment.truth
     correlation = correlation_coefficient(separated.target, truth)

@@ -60,17 +60,11 @@ def view(
     """
     from pydantic import TypeAdapter
 
+    from apps.viewer import still
     from apps.viewer.page import PageDoor
     from apps.viewer.session import Session, read_state, restore_state
     from apps.viewer.source import LayeredSource
     from apps.viewer.source_factory import ShotOptions, open_source
-    from apps.viewer.still import (
-        choose_frames,
-        choose_renderer,
-        open_window,
-        save_film,
-        save_picture,
-    )
 
     # Truth values add up: more than one was asked for.
     if desktop + (png is not None) + (mp4 is not None) > 1:
@@ -107,15 +101,15 @@ def view(
             door.serve(session)
             return
         if desktop:
-            open_window(session)
+            still.open_window(session)
             return
-        renderer, points, further = choose_renderer(), 0, {}
+        renderer, points, further = still.choose_renderer(), 0, {}
         if png is not None:
-            points = save_picture(session, renderer, png)
+            points = still.save_picture(session, renderer, png)
         elif mp4 is not None:
-            further = {"pictures": len(choose_frames(session))}
+            further = {"pictures": len(still.choose_frames(session))}
             with show_progress("filming", further["pictures"]) as advance:
-                points = save_film(session, renderer, mp4, advance)
+                points = still.save_film(session, renderer, mp4, advance)
         figures = {"points": points, "backend": renderer.name}
         figures |= {"seconds": time.perf_counter() - started, **further}
         report(figures, [path for path in (png, mp4) if path is not None])
