@@ -226,8 +226,7 @@ def make_demo_figure(
 
 
 def _draw_brightness(axes: Axes, frames: Frames) -> None:
-    squared = np.maximum(frames.ranges, 0).astype(np.float32) ** 2
-    picture = np.tensordot(squared, frames.values, axes=1)
+    picture = np.tensordot(_compute_compensation(frames), frames.values, axes=1)
     title = f"{frames.figures['method']}: brightness{SQUARED_RANGE}"
     draw_camera_picture(axes, picture, title, "photons at 1 m", **scale_brightness(picture))
 
@@ -289,8 +288,8 @@ def make_scene_figure(
     upper, lower = halves
     front, above = upper.add_subplot(1, 3, 1), upper.add_subplot(1, 3, 3)
     space = upper.add_subplot(1, 3, 2, projection="3d")
-    distance = np.maximum(frames.ranges, 0)
-    brightness = frames.values * (distance**2).astype(np.float32)[:, np.newaxis, np.newaxis]
+    squared = np.maximum(frames.ranges, 0).astype(np.float32) ** 2
+    brightness = frames.values * squared[:, np.newaxis, np.newaxis]
     summed = brightness.sum(axis=0)
     title = f"sum of all frames, {frames.figures.get('method', 'method unknown')}"
     draw_camera_picture(front, summed, title, UNIT, **scale_brightness(summed))
@@ -300,7 +299,7 @@ def make_scene_figure(
     shown = sorted(numbered[:MAX_RANGE_PANELS], key=lambda pair: pair[1].range)
     panels = [front, space, above]
     for column, (number, one) in enumerate(shown, 1):
-        row = np.abs(distance - one.range).argmin()
+        row = np.abs(frames.ranges - one.range).argmin()
         gate = slice(max(0, row - HALF_GATE_BINS), row + HALF_GATE_BINS + 1)
         focus = f", shear {frames.shears[row]:.2f} px" if frames.shears.any() else ""
         picture = brightness[gate].sum(axis=0)

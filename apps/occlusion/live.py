@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from apps.figures.style import tone_map
 from apps.occlusion.experiment import (
     BASELINE_M,
     OCCLUDER_DISTANCE_M,
@@ -146,8 +147,8 @@ def separate_at(
 def pair_pictures(left: Picture, right: Picture) -> Picture:
     """Put two pictures of one shape beside each other, enlarged, each at its own brightness."""
     times = max(1, SHOWN_SIDE_PX // max(left.shape))
-    parts = [np.maximum(one, 0) / max(np.quantile(one, 0.997), 1e-12) for one in (left, right)]
-    first, second = (np.minimum(one, 1).repeat(times, 0).repeat(times, 1) for one in parts)
+    parts = (tone_map(np.maximum(one, 0)) for one in (left, right))
+    first, second = (one.repeat(times, 0).repeat(times, 1) for one in parts)
     gap = np.ones((len(first), GAP_PX))
     return np.hstack([first, gap, second]).astype(np.float32)
 

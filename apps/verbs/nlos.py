@@ -69,7 +69,7 @@ from tofclip.files import PICTURE_SUFFIXES, identify_file, require_apart
 from tofclip.units import MILLIMETRE, PICOSECOND
 
 if TYPE_CHECKING:
-    from nlos import Capture, Grid, Method, Volume
+    from nlos import Capture, Method, Volume
     from nlos.imaging import PreparedImaging
     from tofclip.sequences.jobs import Report
 
@@ -84,14 +84,6 @@ VOLUME_SUFFIXES = (*RECORD_SUFFIXES, ".vti", ".npz", ".exr", ".ply", ".pcd", ".c
 FOLDER_SETTINGS_NAME = ".settings.toml"
 CONTENT_MARK = "# the capture's content: "
 """In the settings beside a volume: what the capture was that it was made of."""
-
-MAX_BLUR_FRACTION = 0.5
-"""A wavelength is usable while a point's image is narrower than this share of the wall."""
-
-BLUR_FACTOR = 1.2
-"""Width of a point's image in units of wavelength * distance / width of the wall; see
-`nlos.resolution`.
-"""
 
 app = make_group("Image the scene hidden around a corner.")
 
@@ -466,6 +458,7 @@ def info(wanted: ImagingSettings, source: Path = CAPTURE, settings: Path | None 
 
     Example: tofclip nlos info capture.h5
     """
+    from nlos.analysis import find_longest_wavelength, find_shortest_wavelength
     from nlos.band import VirtualPulse
     from nlos.imaging import find_settings
     from nlos.io import read_capture
@@ -481,7 +474,7 @@ def info(wanted: ImagingSettings, source: Path = CAPTURE, settings: Path | None 
     middle = [axis[[0, -1]].mean() for axis in (grid.x, grid.y, grid.z)]
     pulse = VirtualPulse(found.wavelength or 0.0, found.cycles)
     paths = capture.axis.paths
-    usable = _find_usable_wavelengths(capture, grid, found.cycles)
+    shortest = find_shortest_wavelength(capture, found.cycles) / MILLIMETRE
     figures = {
         "wall": _describe_wall(capture),
         "laser": _describe_laser(capture),
@@ -492,7 +485,11 @@ def info(wanted: ImagingSettings, source: Path = CAPTURE, settings: Path | None 
             "first_path_m": paths[0],
             "last_path_m": paths[-1],
         },
-        "wavelength_mm": {**usable, "chosen": shown["wavelength_mm"]},
+        "wavelength_mm": {
+            "shortest": shortest,
+            "longest": find_longest_wavelength(capture) / MILLIMETRE,
+            "chosen": shown["wavelength_mm"],
+        },
         "gate": {"m": found.gate, "found": found.gate_found},
         "bins_together": found.bins_together,
         "method": found.method,
@@ -508,7 +505,7 @@ def info(wanted: ImagingSettings, source: Path = CAPTURE, settings: Path | None 
     }
     suits |= {name: {"suits": False, "reason": reason} for name, reason in refused.items()}
     note = ""
-    if shown["wavelength_mm"] < usable["shortest"]:
+    if shown["wavelength_mm"] < shortest:
         note = "the wall samples the shortest wavelength at every angle, the chosen one at that of the brightest light"
     report({**figures, "methods": suits}, note=note)
 
@@ -546,19 +543,6 @@ def _describe_laser(capture: Capture) -> str:
         return f"{len(parts)} spots"
     x, y, z = parts[0].laser
     return f"one spot at ({x:.3g}, {y:.3g}, {z:.3g}) m"
-
-
-def _find_usable_wavelengths(capture: Capture, grid: Grid, cycles: float) -> dict[str, float]:
-    """Bounds of the carrier: what is sampled finely enough, and what still resolves something, mm."""
-    from nlos.analysis import find_shortest_wavelength
-
-    low, high = capture.points.min(axis=0), capture.points.max(axis=0)
-    width = float(max(high[0] - low[0], high[1] - low[1]))
-    distance = grid.z[[0, -1]].mean() - capture.points[:, 2].mean()
-    return {
-        "shortest": find_shortest_wavelength(capture, cycles) / MILLIMETRE,
-        "longest": MAX_BLUR_FRACTION * width**2 / (BLUR_FACTOR * distance) / MILLIMETRE,
-    }
 
 
 app.command()(demo)

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
+from apps.figures.style import tone_map
 from apps.viewer.source import Limits, Picture, View
 from tofclip.arrays import AnyArray, Float32Array, FloatArray
 from tofclip.errors import InputError
@@ -256,7 +257,6 @@ def find_point_on_ray(xyz: Float32Array, origin: ArrayLike, direction: ArrayLike
     return int(np.argmin(miss)) if miss.size and miss.min() <= MAX_MISS_RAD else None
 
 
-PICTURE_WHITE_PERCENTILE = 99.7  # a glint does not darken the rest
 PICTURE_GAMMA = 0.6  # far objects stay visible beside near ones
 EMPTY_COLOUR = (32, 36, 44)
 FRONT_SIDE_PX, MIN_SIDE_PX, MAX_SIDE_PX = 128, 200, 420
@@ -279,9 +279,7 @@ def render_pictures(pictures: Mapping[str, Picture], scale: Scale) -> dict[str, 
 
 def _colour_brightness(picture: Picture, scale: Scale) -> Image:
     """Colour a picture by its brightness, negative values as dark."""
-    light = np.maximum(np.nan_to_num(picture), 0)
-    top = np.percentile(light, PICTURE_WHITE_PERCENTILE) or light.max() or 1.0
-    toned = np.clip(light / np.float32(top), 0, 1) ** np.float32(PICTURE_GAMMA)
+    toned = tone_map(np.maximum(np.nan_to_num(picture), 0), PICTURE_GAMMA)
     palette = load_palette(scale.palette if scale.quantity == "intensity" else "grey")
     return palette[(255 * toned).astype(np.intp)]
 
