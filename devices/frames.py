@@ -5,7 +5,7 @@ picture, which turns a camera's frames into photons counted in time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Self
@@ -18,7 +18,7 @@ from devices.stream import Feed, InstrumentClock, LiveOptions, Transfer, retry_c
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.errors import InputError, require
-from tofclip.storage import Field, Record, Scalar
+from tofclip.storage import Field, Record
 
 
 @dataclass(frozen=True)
@@ -119,11 +119,6 @@ class FrameCodec(Codec):
         """`number` and `counts` (rows, columns)."""
         counts = ("counts", _PIXEL_DTYPES[self.bits], (self.rows, self.columns))
         return np.dtype([("number", _NUMBER_DTYPE), counts])
-
-    @property
-    def settings(self) -> Mapping[str, Scalar]:
-        shape = {"rows": self.rows, "columns": self.columns, "bits": self.bits}
-        return {**shape, "quarter_turns": self.quarter_turns} if self.quarter_turns else shape
 
     @property
     def pixel_bytes(self) -> int:

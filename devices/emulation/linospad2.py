@@ -14,7 +14,7 @@ from time import monotonic, sleep
 import numpy as np
 
 from devices.address import Uri, option
-from devices.emulation.scenes import LineLight, draw_cells, simulate_line_light
+from devices.emulation.scenes import LineLight, draw_cells, simulate_light
 from devices.linospad2 import (
     CLOCK_PERIOD_S,
     CODES_PER_PERIOD,
@@ -147,7 +147,7 @@ def open_simulated(uri: Uri) -> StreamSource:
     """Open ``sim+linospad2://``; `SimulationOptions` has its values."""
     options = SimulationOptions.from_uri(uri)
     board = SimulatedBoard(
-        simulate_line_light(),
+        simulate_light("small"),
         draw_uneven_calibration(options.seed),
         LinoSpad2Codec(options.firmware, options.timestamps, options.counter),
         options.photons,

@@ -101,26 +101,27 @@ def make_line_scene() -> Scene:
     )
 
 
-@lru_cache(maxsize=1)
-def simulate_line_light() -> LineLight:
-    """Return, always the same object, the light of `make_line_scene` on the pixels of `make_line_instrument`."""
-    return _simulate_light(make_line_scene(), make_line_instrument())
-
-
-@lru_cache(maxsize=1)
-def simulate_demonstration_light() -> LineLight:
-    """Return, always the same, the demonstration's light; its camera lacks sweep and gains."""
-    # Rays at half of the demonstration's density: nobody has to wait for an instrument that is not there.
-    instrument = replace(make_default_instrument(), rays_per_pixel_side=2)
-    light = _simulate_light(make_default_scene(), instrument)
-    return replace(
-        light, camera=replace(light.camera, sweep=None, gains=np.ones(light.camera.views))
-    )
-
-
+@lru_cache(maxsize=2)
 def simulate_light(scene: str) -> LineLight:
-    """Return the light of a scene as addresses call it: ``small``, or ``demo``."""
-    return simulate_line_light() if scene == "small" else simulate_demonstration_light()
+    """Return, always the same object, the light of a scene as addresses call it: ``small``,
+    `make_line_scene` on the pixels of `make_line_instrument`; or ``demo``, the demonstration's, whose
+    camera lacks sweep and gains.
+    """
+    if scene == "small":
+        seen, instrument = make_line_scene(), make_line_instrument()
+    else:
+        # Rays at half of its density: nobody has to wait for an instrument that is not there.
+        instrument = replace(make_default_instrument(), rays_per_pixel_side=2)
+        seen = make_default_scene()
+    shot = simulate_shot(
+        seen, instrument, seed=0
+    )  # the expected signal: no noise for a seed to draw
+    photons = shot.signal.astype(np.float64) + instrument.detector.background_photons
+    photons.flags.writeable = False  # it is shared by all who look at this scene
+    camera = shot.camera
+    if scene != "small":
+        camera = replace(camera, sweep=None, gains=np.ones(camera.views))
+    return LineLight(photons, instrument.detector.row_times, camera, shot.truth)
 
 
 def render_array_light() -> FloatArray:
@@ -151,13 +152,3 @@ def _render_truth() -> GroundTruth:
 def _enlarge(picture: Float32Array) -> FloatArray:
     """Let 4 x 4 pixels of an array of 512 x 512 see each pixel of the reference view."""
     return np.asarray(np.kron(picture, np.ones((4, 4))), np.float64)
-
-
-def _simulate_light(scene: Scene, instrument: Instrument) -> LineLight:
-    shot = simulate_shot(
-        scene, instrument, seed=0
-    )  # the expected signal has no noise for a seed to draw
-    detector = instrument.detector
-    photons = shot.signal.astype(np.float64) + detector.background_photons
-    photons.flags.writeable = False  # it is shared by all who look at this scene
-    return LineLight(photons, detector.row_times, shot.camera, shot.truth)

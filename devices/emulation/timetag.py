@@ -20,14 +20,13 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from time import monotonic, sleep
 
 import numpy as np
 
 from devices.address import Uri, option
 from devices.emulation.harness import FOREVER, REPLY_FAULTS, Fault
-from devices.emulation.scenes import LineLight, draw_cells, simulate_line_light
+from devices.emulation.scenes import LineLight, draw_cells, simulate_light
 from devices.emulation.usb import PACKET_BYTES, VirtualDevice, VirtualUsb, make_usb_error
 from devices.source import ByteView, Records
 from devices.stream import StreamSource
@@ -589,15 +588,13 @@ def open_timetag(uri: Uri) -> StreamSource:
     ``memory_mib=0.01172``.
     """
     options = EmulationOptions.from_uri(uri)
-    make: Callable[..., PoissonStream | PulsedSceneStream] = PoissonStream
-    rate = POISSON_RATE_HZ
-    if options.light == "scene":
-        make, rate = partial(PulsedSceneStream, simulate_line_light()), SCENE_RATE_HZ
-    if options.rate is not None:
-        rate = options.rate
+    is_scene = options.light == "scene"
+    usual = SCENE_RATE_HZ if is_scene else POISSON_RATE_HZ
+    rate = usual if options.rate is None else options.rate
 
     def make_light(resets: int) -> PoissonStream | PulsedSceneStream:
-        return make(rate, CLOCK_HZ, options.seed + resets)
+        how = rate, CLOCK_HZ, options.seed + resets
+        return PulsedSceneStream(simulate_light("small"), *how) if is_scene else PoissonStream(*how)
 
     # The real ones have no serial number.
     return EmulatedTimeTagger(make_light, options, uri.location).open_driver()

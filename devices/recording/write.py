@@ -71,7 +71,7 @@ class RecordingWriter:
         self._clock_offset_ns = time_ns() - monotonic_ns()
         self._checked_at = monotonic()
         self._head = _render_head(head)
-        with contextlib.ExitStack() as stack:
+        with _explain_refusal(path), contextlib.ExitStack() as stack:
             self._file, temporary = _create_file(path, overwrite, stack)
             self._append(BlockKind.HEAD, self._head)
             self._append(BlockKind.HEAD, self._head)
@@ -174,17 +174,16 @@ def _create_file(path: Path, overwrite: bool, stack: contextlib.ExitStack) -> tu
     """Create and lock a file beside `path`, which gets its name when the head is in it. The lock on
     a file that exists already is held as long, so that of two recorders one is refused.
     """
-    with _explain_refusal(path):
-        old = _lock_existing(path)
-        if old is not None:
-            stack.callback(os.close, old)
-            require(overwrite, f"{path}: {_EXISTS}")
-        temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
-        # 0o666, less what the user's umask takes away.
-        file = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        stack.callback(temporary.unlink, missing_ok=True)
-        stack.push(lambda kind, *_: os.close(file) if kind is not None else None)
-        _lock(file, path)
+    old = _lock_existing(path)
+    if old is not None:
+        stack.callback(os.close, old)
+        require(overwrite, f"{path}: {_EXISTS}")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+    # 0o666, less what the user's umask takes away.
+    file = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+    stack.callback(temporary.unlink, missing_ok=True)
+    stack.push(lambda kind, *_: os.close(file) if kind is not None else None)
+    _lock(file, path)
     return file, temporary
 
 
@@ -220,13 +219,12 @@ def _lock(file: int, path: Path) -> None:
 
 def _publish(temporary: Path, path: Path, overwrite: bool) -> None:
     """Give the file its name; without `overwrite` never in place of another."""
-    with _explain_refusal(path):
-        try:
-            if not overwrite:
-                os.link(temporary, path)
-        except FileExistsError:
-            raise InputError(f"{path}: {_EXISTS}") from None
-        except OSError:  # a file system without links
-            overwrite = True
-        if overwrite:
-            os.replace(temporary, path)
+    try:
+        if not overwrite:
+            os.link(temporary, path)
+    except FileExistsError:
+        raise InputError(f"{path}: {_EXISTS}") from None
+    except OSError:  # a file system without links
+        overwrite = True
+    if overwrite:
+        os.replace(temporary, path)

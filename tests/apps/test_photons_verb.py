@@ -10,7 +10,7 @@ import pytest
 from small_instrument import BACKGROUND, BIN_WIDTH, IMAGE_SHAPE, ROWS, save_plate
 
 from devices.emulation.linospad2 import LASER_PERIOD_S, SimulatedBoard
-from devices.emulation.scenes import render_array_delays, simulate_line_light
+from devices.emulation.scenes import render_array_delays, simulate_light
 from devices.linospad2 import BoardCalibration, LinoSpad2Codec
 from devices.transients import find_address, read_photons
 from tofclip.camera import Camera
@@ -127,7 +127,7 @@ def test_a_recording_of_a_gated_array_becomes_ranges(shell):
 
 def test_a_recording_of_time_stamps_becomes_ranges(shell):
     """LinoSPAD2's own file and a recording of ours, by their plain names."""
-    light, codec = simulate_line_light(), LinoSpad2Codec("2212s", 24, True)
+    light, codec = simulate_light("small"), LinoSpad2Codec("2212s", 24, True)
     board = SimulatedBoard(light, BoardCalibration.ideal(), codec, 300, 3)
     Path("run.dat").write_bytes(b"".join(board.encode_cycle(number) for number in range(12)))
     Path("run.toml").write_text(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from devices.emulation.remoteex import EmulatedStreakCamera
-from devices.emulation.scenes import EmulatedLight, simulate_line_light
+from devices.emulation.scenes import EmulatedLight, simulate_light
 from tofclip.camera import Camera, SkewSweep
 from tofclip.io.streaks import save_stack
 from tofclip.lidar import PointCloud, depth
@@ -35,7 +35,7 @@ STREAK_CAMERA = "'sim+remoteex://?seed=1&scene=small&frame_rate=40'"
 
 @pytest.fixture(scope="module")
 def light():
-    return simulate_line_light()
+    return simulate_light("small")
 
 
 @pytest.fixture

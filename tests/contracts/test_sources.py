@@ -12,7 +12,7 @@ import pytest
 
 import devices
 from devices.emulation.linospad2 import SimulatedBoard, draw_uneven_calibration
-from devices.emulation.scenes import simulate_line_light
+from devices.emulation.scenes import simulate_light
 from devices.linospad2 import LinoSpad2Codec
 from devices.recorder import record_source
 from devices.recording.check import verify
@@ -76,7 +76,7 @@ def recorded_linospad2(folder):
 def words_of_linospad2(folder):
     path = folder / "words.dat"
     if not path.exists():
-        parts = simulate_line_light(), draw_uneven_calibration(2), LinoSpad2Codec()
+        parts = simulate_light("small"), draw_uneven_calibration(2), LinoSpad2Codec()
         board = SimulatedBoard(*parts, 100, 2)
         path.write_bytes(b"".join(board.encode_cycle(number) for number in range(45)))
         path.with_suffix(".toml").write_text(

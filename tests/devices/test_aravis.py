@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import devices
 from devices.aravis import UNNUMBERED, find_cameras, load_aravis
 from devices.emulation.aravis import EmulatedCamera
-from devices.emulation.scenes import EmulatedLight, simulate_line_light
+from devices.emulation.scenes import EmulatedLight, simulate_light
 from devices.transients import TransientStream, read_photons, read_transient
 from tofclip.errors import (
     DeviceDisconnectedError,
@@ -59,7 +59,7 @@ def test_frames_with_missing_packets_are_counted(aravis, lost_per_thousand, monk
     one is lost, the frame comes without an identifier.
     """
     sent = []
-    picture = EmulatedLight.of(simulate_line_light(), 1).draw_frame(0)
+    picture = EmulatedLight.of(simulate_light("small"), 1).draw_frame(0)
 
     def draw_and_note(self, number):
         sent.append(number)
@@ -225,7 +225,7 @@ def test_packets_without_a_buffer_are_counted_as_frames(stand_in):
 
 def test_a_streak_picture_has_its_rows_in_time(stand_in):
     """The address says how long they take; when the first one is swept, the time zero does."""
-    light = simulate_line_light()
+    light = simulate_light("small")
     counts = np.random.default_rng(1).poisson(light.photons).astype(np.uint16)
     stand_in(counts[np.newaxis], list(range(1, 4)))
     row_ps = (light.row_times[1] - light.row_times[0]) * 1e12
@@ -237,8 +237,8 @@ def test_a_streak_picture_has_its_rows_in_time(stand_in):
 def test_each_streak_picture_of_the_emulated_camera_becomes_a_cloud(aravis):
     """Over the network protocol: the clouds are those of the pictures that it drew."""
     shots = TransientStream("sim+aravis://?scene=small&frame_rate=10&seed=1&policy=block")
-    light = EmulatedLight.of(simulate_line_light(), 1)
-    camera = simulate_line_light().camera
+    light = EmulatedLight.of(simulate_light("small"), 1)
+    camera = simulate_light("small").camera
     first = next(shots)
     pipeline = RangingPipeline.for_shot(first, camera, FixedFocus(0.0), camera.time_zero)
     clouds = [result.cloud for result in stream_clouds([first, next(shots), next(shots)], pipeline)]

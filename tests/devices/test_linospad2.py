@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import devices
 from devices import linospad2
 from devices.emulation.linospad2 import SimulatedBoard, draw_uneven_calibration
-from devices.emulation.scenes import make_line_instrument, simulate_line_light
+from devices.emulation.scenes import make_line_instrument, simulate_light
 from devices.histogram import BinAxis, StampHistogram
 from devices.linospad2 import BoardCalibration, LinoSpad2Codec, load_calibration, read_sidecar
 from devices.transients import read_transient
@@ -30,7 +30,7 @@ def uneven():
 
 @pytest.fixture(scope="module")
 def light():
-    return simulate_line_light()
+    return simulate_light("small")
 
 
 def write_tables(folder, board):

@@ -19,7 +19,7 @@ from test_faults import draw_tagger_script
 import devices
 from devices.emulation.harness import HOST
 from devices.emulation.remoteex import EmulatedStreakCamera
-from devices.emulation.scenes import EmulatedLight, simulate_line_light
+from devices.emulation.scenes import EmulatedLight, simulate_light
 from devices.emulation.timetag import CLOCK_HZ, MAX_TICK, PoissonStream
 from devices.recorder import record_source
 from devices.recording.check import repair, verify
@@ -226,7 +226,7 @@ def test_a_killed_recorder_of_a_stream_that_pauses_has_all_that_came(path):
 @pytest.mark.parametrize("count", [3, pytest.param(60, marks=pytest.mark.nightly)])
 def test_whenever_a_signal_comes_the_gain_goes_down(tmp_path, count):
     """And the file is whole."""
-    camera = EmulatedStreakCamera(EmulatedLight.of(simulate_line_light(), 1), 50)
+    camera = EmulatedStreakCamera(EmulatedLight.of(simulate_light("small"), 1), 50)
     port, data_port = camera.ports
     address = f"remoteex://{HOST}:{port}?data_port={data_port}&mcp_gain=40"
     words = (ROOT / "tests/devices/ended_recorders.py", tmp_path, count, 7, address)

@@ -24,7 +24,7 @@ from devices.emulation.scenes import (
     EmulatedLight,
     render_array_delays,
     render_array_light,
-    simulate_line_light,
+    simulate_light,
 )
 from devices.emulation.spad512 import EmulatedSpadArray
 from devices.remoteex import (
@@ -408,7 +408,7 @@ def test_a_synchroscan_unit_counts_its_time_in_ps(camera):
 
 
 def test_an_emulated_camera_sees_a_scene():
-    light = simulate_line_light()
+    light = simulate_light("small")
     address = "sim+remoteex://?seed=4&scene=small&frame_rate=100&frames=4&mcp_gain=5"
     with devices.open(address) as source:
         frames, known, info = take(source, 4), source.calibration, source.info

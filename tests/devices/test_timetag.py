@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import devices
 from devices.emulation.harness import Fault
-from devices.emulation.scenes import simulate_line_light
+from devices.emulation.scenes import simulate_light
 from devices.emulation.timetag import (
     BOARD_MEMORY_BYTES,
     CLOCK_HZ,
@@ -202,7 +202,7 @@ SCENE_RATE = 2e6
 
 @pytest.fixture(scope="module")
 def light():
-    return simulate_line_light()
+    return simulate_light("small")
 
 
 def test_light_that_does_not_fit_is_refused(light):
