@@ -85,8 +85,9 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers,
     before, after = weights[0], weights[1]
     weighted = powers[0] != 0 or powers[1] != 0
     for p in range(wall.shape[0]):
-        # the outgoing leg is the same for all points that share a laser spot
-        if p == 0 or (p < lasers.shape[0] and _points_differ(lasers[p], lasers[p - 1])):
+        # The outgoing leg is the same for all points that share a laser spot: in an exhaustive capture
+        # many in a row.
+        if p == 0 or (p < lasers.shape[0] and np.any(lasers[p] != lasers[p - 1])):
             _compute_outward_samples(lasers[p], start, per_metre, x, y, z, outward)
         for iz in range(z.size):
             for iy in range(y.size):
@@ -106,12 +107,6 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers,
                 field[iz, iy, ix] += complex(
                     row[ix, 0, 0] + row[ix, 1, 0], row[ix, 0, 1] + row[ix, 1, 1]
                 )
-
-
-@compiled
-def _points_differ(one, other):
-    """Whether two points do; in an exhaustive capture many in a row are the same."""
-    return one[0] != other[0] or one[1] != other[1] or one[2] != other[2]
 
 
 @compiled

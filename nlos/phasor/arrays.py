@@ -13,7 +13,7 @@ import numpy as np
 from nlos.band import Band
 from nlos.capture import Capture
 from nlos.plane import WallLattice
-from tofclip.arrays import AnyArray, Array, ComputeDevice, FloatArray, namespace
+from tofclip.arrays import AnyArray, Array, ComputeDevice, namespace
 
 # Bytes of the largest array made at a time: on a processor, with its caches, and on a GPU.
 CPU_CHUNK_BYTES, GPU_CHUNK_BYTES = 8 << 20, 256 << 20
@@ -48,12 +48,6 @@ class ArrayLibrary:
         """Return ``exp(2j * pi * cycles)``, accurate however large the cycles are."""
         angle = 2 * np.pi * (cycles - self.xp.round(cycles))
         return self.xp.exp(1j * self.xp.astype(angle, self.xp.complex64))
-
-
-def remove_whole_cycles(cycles: Any) -> FloatArray:
-    """Leave out whole cycles in double precision: the rest goes well into single."""
-    values = np.asarray(cycles, np.float64)
-    return values - np.round(values)
 
 
 class BandTransform:

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nlos.method import Progress, ignore_progress
-from nlos.phasor.arrays import ArrayLibrary, remove_whole_cycles
-from nlos.phasor.depth_steps import DepthInterpolation, DiffractionPlan
+from nlos.phasor.arrays import ArrayLibrary
+from nlos.phasor.depth_steps import DepthInterpolation, DiffractionPlan, Illumination
 from nlos.phasor.to_depths_compiled import LaserSource
 from nlos.phasor.to_depths_kernels import TAPS
 from tofclip.arrays import Array, ComplexArray, FloatArray
-from tofclip.threads import run_blocks, split_blocks, thread_count
+from tofclip.threads import map_parallel, run_blocks, split_blocks, thread_count
 
 # Transfer functions and illuminations are kept for the next field if they take no more.
 MAX_CACHE_BYTES = 1 << 30
@@ -181,15 +181,13 @@ class PortableDiffraction:
     def to_volume(self, values: Array) -> Array:
         """Return the real part (z, y, x) of what `add` gives for a field (y, x, frequencies)."""
         waves, planes = self.waves.to_waves(values), self._block_slices
-        parts: dict[int, Array] = {}
+        xp = self.library.xp
 
-        def process_block(turn: slice) -> None:
-            block = self._get_block(planes[turn.start])
-            field = self._illuminate(block, waves) * self._carrier(block.depths)
-            parts[turn.start] = self.library.xp.real(field)
+        def process_block(some: slice) -> Array:
+            block = self._get_block(some)
+            return xp.real(self._illuminate(block, waves) * self._carrier(block.depths))
 
-        run_blocks(process_block, len(planes), size=1)
-        return self.library.xp.concat([parts[i] for i in range(len(planes))], axis=0)
+        return xp.concat(list(map_parallel(process_block, planes, len(planes))), axis=0)
 
     def to_plane(self, volume: Array) -> Array:
         """Return the field (y, x, frequencies) of a real volume (z, y, x): the adjoint of
@@ -250,7 +248,8 @@ class PortableDiffraction:
         if self.source.laser is None:
             return self.library.xp.ones_like(distance)
         # whole cycles are taken off before single precision would lose the fraction
-        cycles = self.library.put(remove_whole_cycles(wavenumber * ahead))
+        cycles = wavenumber * ahead
+        cycles = self.library.put(cycles - np.round(cycles))
         return self.library.exp_cycles(cycles + self._extra_distance(distance) * wavenumber)
 
     @cached_property
@@ -279,17 +278,14 @@ class PortableDiffraction:
     def _plan_block(self, some: slice) -> _DepthBlock:
         """Plan some depths on this machine's processor, and bring what they need to the library."""
         depths = self.plan.grid.z[self._computed_depths.nodes[some]]
-        lights: list[Any] = [None] * depths.size
-        nodes: list[Any] = [None] * depths.size
         self.plan.transfer.tabulate()
 
-        def plan(planes: slice) -> None:
-            for i in range(planes.start, planes.stop):
-                light = lights[i] = self.source.illuminate_plane(self.plan, float(depths[i]))
-                delay = np.array([light.span.mean(), self.source.centre_wavenumber])
-                nodes[i] = self.waves.transfer_nodes(float(depths[i]), delay)
+        def plan(depth: float) -> tuple[Illumination, ComplexArray]:
+            light = self.source.illuminate_plane(self.plan, depth)
+            delay = np.array([light.span.mean(), self.source.centre_wavenumber])
+            return light, self.waves.transfer_nodes(depth, delay)
 
-        run_blocks(plan, depths.size, size=1)
+        lights, nodes = zip(*map_parallel(plan, depths.tolist(), depths.size), strict=True)
         max_terms = max(light.coefficients.shape[1] for light in lights)
         samples = len(lights[0].table)
         shape = len(lights), len(lights[0].coefficients), max_terms

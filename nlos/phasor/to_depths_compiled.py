@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,6 @@ from nlos.phasor.depth_steps import (
     DepthInterpolation,
     DiffractionPlan,
     Illumination,
-    InterpolatedBlock,
     PlaneWaves,
     build_constant_illumination,
     choose_depths,
@@ -41,7 +40,7 @@ from nlos.phasor.to_depths_kernels import (
 from nlos.phasor.transfer import VECTOR_LENGTH, TransferFunction
 from nlos.plane import Plane
 from tofclip.arrays import ComplexArray, Float32Array, FloatArray, IntArray
-from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
+from tofclip.threads import limit_blas_threads, map_parallel, run_blocks, split_blocks
 
 FREQUENCIES_PER_BLOCK = 4
 
@@ -412,20 +411,15 @@ class CompiledDiffraction:
                 self._spare.append(workspace)
                 progress(int(shares[planes.stop] - shares[planes.start]) * total[0].size)
 
-            run_blocks(process_block, len(lights), size=PLANES_PER_BLOCK)
-            run_blocks(
-                lambda some: self._interpolate(blocks[some.start], computed, total), len(blocks), 1
-            )
+            def interpolate(some: slice) -> None:
+                block, grid, source = blocks[some.start], plan.grid, self.source
+                known, part = computed[block.nodes], total[block.depths]
+                values = (block.weights @ known.reshape(len(known), -1)).reshape(part.shape)
+                axes = grid.x, grid.y, grid.z[block.depths]
+                add_with_carrier(values, *axes, source.position, source.centre_wavenumber, part)
 
-    def _interpolate(
-        self, block: InterpolatedBlock, computed: ComplexArray, total: ComplexArray
-    ) -> None:
-        """Add some depths that follow from computed ones without the laser's carrier."""
-        grid, source, part = self.plan.grid, self.source, total[block.depths]
-        known = computed[block.nodes].reshape(block.nodes.stop - block.nodes.start, -1)
-        values = (block.weights @ known).reshape(part.shape)
-        axes = grid.x, grid.y, grid.z[block.depths]
-        add_with_carrier(values, *axes, source.position, source.centre_wavenumber, part)
+            run_blocks(process_block, len(lights), size=PLANES_PER_BLOCK)
+            run_blocks(interpolate, len(blocks), size=1)
 
     @cached_property
     def _depths(self) -> DepthInterpolation:
@@ -435,15 +429,9 @@ class CompiledDiffraction:
     @cached_property
     def _lights(self) -> list[Illumination]:
         """The illumination of every computed depth."""
-        depths = self.plan.grid.z[self._depths.nodes]
-        lights: dict[int, Illumination] = {}
-
-        def split(planes: slice) -> None:
-            for i in range(planes.start, planes.stop):
-                lights[i] = self.source.illuminate_plane(self.plan, float(depths[i]))
-
-        run_blocks(split, depths.size, size=PLANES_PER_BLOCK)
-        return [lights[i] for i in range(depths.size)]
+        depths = self.plan.grid.z[self._depths.nodes].tolist()
+        split = partial(self.source.illuminate_plane, self.plan)
+        return list(map_parallel(split, depths, len(depths)))
 
     @cached_property
     def _interpolation(self) -> Interpolation:

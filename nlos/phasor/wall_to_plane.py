@@ -28,7 +28,7 @@ from nlos.phasor.transfer import (
 from nlos.phasor.wall_kernels import VECTOR_FLOATS
 from nlos.plane import Plane, StraightPaths, WallLattice, axis_step
 from tofclip.arrays import ComplexArray, Float32Array, FloatArray, IntArray
-from tofclip.threads import run_blocks, split_blocks
+from tofclip.threads import map_parallel, run_blocks, split_blocks
 
 if TYPE_CHECKING:
     import finufft
@@ -290,16 +290,14 @@ class LowRankTransfer:
         lateral = np.maximum(transfer.nodes[::every], 0)[:, np.newaxis]
         weights = np.sqrt(lateral * (lateral <= lateral_limits)) * strength
         coarse, weights = table[:, ::every], weights.astype(np.float32)
-        energies = [(np.empty(0), np.empty((0, 0), np.complex64))] * len(groups)
 
-        def decompose(block: slice) -> None:
-            for i in range(block.start, block.stop):
-                weighted = coarse[..., groups[i]] * weights[:, groups[i]]
-                flat = weighted.reshape(len(weighted), -1)
-                values, vectors = np.linalg.eigh(flat.conj() @ flat.T)
-                energies[i] = np.maximum(values, 0).astype(np.float64), vectors
+        def decompose(group: slice) -> tuple[FloatArray, ComplexArray]:
+            weighted = coarse[..., group] * weights[:, group]
+            flat = weighted.reshape(len(weighted), -1)
+            values, vectors = np.linalg.eigh(flat.conj() @ flat.T)
+            return np.maximum(values, 0).astype(np.float64), vectors
 
-        run_blocks(decompose, len(groups), size=1)
+        energies = list(map_parallel(decompose, groups, len(groups)))
         ordered = np.sort(np.concatenate([values for values, _ in energies]))
         allowed = (TERMS_ERROR_FRACTION * tolerance) ** 2 * ordered.sum()
         # the weakest term kept: all below it hold the allowed energy, over all groups together
