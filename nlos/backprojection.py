@@ -7,21 +7,21 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from nlos.band import Band, VirtualPulse, Waveforms
+from nlos.band import Band, Waveforms
 from nlos.capture import Capture, select_lasers
 from nlos.illumination import warn_of_aliasing
 from nlos.kernels import MIN_DISTANCE_M, add_backprojection
 from nlos.method import (
     Method,
-    PhasorMethod,
     PhasorPlan,
     Plan,
     Progress,
+    PulsedMethod,
     require_imageable,
     require_numpy_signal,
 )
@@ -64,7 +64,7 @@ class Weighting:
 
 
 @dataclass(frozen=True)
-class Backprojection(PhasorMethod):
+class Backprojection(PulsedMethod):
     """Point-wise back-projection with a virtual pulse: exact for every wall, laser and grid, slow.
 
     ``I(r) = | sum_p s_p(|r_L - r| + |r - r_p|) / |r - r_p| |`` with s_p the signal of wall point
@@ -92,14 +92,6 @@ class Backprojection(PhasorMethod):
     wavelength: float
     cycles: float = 3.0
     weighting: Weighting = Weighting()
-
-    def __post_init__(self) -> None:
-        _ = self.pulse
-
-    @cached_property
-    def pulse(self) -> VirtualPulse:
-        """The virtual pulse."""
-        return VirtualPulse(self.wavelength, self.cycles)
 
     def plan(self, capture: Capture, grid: Grid) -> BackprojectionPlan:
         require_imageable(capture, grid)

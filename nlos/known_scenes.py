@@ -136,10 +136,8 @@ class HiddenTruth(Storable):
     def mask_near(self, grid: Grid, reach: float) -> BoolArray:
         """Voxels (z, y, x) whose centres lie within `reach` m of something hidden."""
         require_positive("the reach about hidden things", reach, "number of metres")
-        z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
-        voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
-        found, _ = cKDTree(self.positions).query(voxels, distance_upper_bound=reach)
-        return np.isfinite(found).reshape(grid.shape)
+        found, _ = cKDTree(self.positions).query(grid.points, distance_upper_bound=reach)
+        return np.isfinite(found)
 
 
 def compare_with_truth(volume: Volume, truth: HiddenTruth) -> dict[str, float]:

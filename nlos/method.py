@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from nlos.band import VirtualPulse
 from nlos.capture import Capture
 from nlos.volume import Grid, Volume
 from tofclip.arrays import is_numpy
@@ -181,6 +182,21 @@ class PhasorMethod(Method):
     ) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives; see `PhasorPlan.field`."""
         return self.plan(capture, grid).field(capture, progress)
+
+
+class PulsedMethod(PhasorMethod):
+    """A method that sees a capture by a virtual pulse of so many `cycles` of a `wavelength`, m."""
+
+    wavelength: float
+    cycles: float
+
+    def __post_init__(self) -> None:
+        _ = self.pulse
+
+    @cached_property
+    def pulse(self) -> VirtualPulse:
+        """The virtual pulse."""
+        return VirtualPulse(self.wavelength, self.cycles)
 
 
 def require_imageable(capture: Capture, grid: Grid) -> None:

@@ -161,6 +161,12 @@ class Grid:
         return self.z.size, self.y.size, self.x.size
 
     @property
+    def points(self) -> FloatArray:
+        """Position of every voxel, m, shape (z, y, x, 3)."""
+        z, y, x = np.meshgrid(self.z, self.y, self.x, indexing="ij")
+        return np.stack([x, y, z], axis=-1)
+
+    @property
     def size(self) -> int:
         """Number of voxels."""
         return self.z.size * self.y.size * self.x.size

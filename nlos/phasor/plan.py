@@ -13,12 +13,11 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 
-from nlos.band import Band, VirtualPulse
+from nlos.band import Band
 from nlos.capture import Capture
 from nlos.illumination import (
     IlluminationGroup,
@@ -31,7 +30,7 @@ from nlos.illumination import (
     warn_of_aliasing,
 )
 from nlos.kernels import MIN_DISTANCE_M
-from nlos.method import PhasorMethod, PhasorPlan, Progress, SubProgress, require_imageable
+from nlos.method import PhasorPlan, Progress, PulsedMethod, SubProgress, require_imageable
 from nlos.phasor.depth_steps import BYTES_PER_WAVE, DiffractionPlan
 from nlos.phasor.propagate import (
     Backend,
@@ -196,22 +195,15 @@ plane, and the fraction of time that this takes.
 """
 
 
-class WaveMethod(PhasorMethod):
+class WaveMethod(PulsedMethod):
     """Imaging by waves, a field for every laser spot; `_plan_points` is what methods differ by."""
 
-    wavelength: float
-    cycles: float
     tolerance: float
     name: ClassVar[str]
 
     def __post_init__(self) -> None:
-        _ = self.pulse
+        super().__post_init__()
         require_tolerance(self.tolerance)
-
-    @cached_property
-    def pulse(self) -> VirtualPulse:
-        """The virtual pulse."""
-        return VirtualPulse(self.wavelength, self.cycles)
 
     @property
     def settings(self) -> dict[str, str | float]:

@@ -99,9 +99,7 @@ class TimeOfFlight:
 
     @cached_property
     def _places(self) -> Float32Array:
-        grid = self.grid
-        z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
-        return np.stack([x.ravel(), y.ravel(), z.ravel()]).astype(np.float32)
+        return np.ascontiguousarray(self.grid.points.reshape(-1, 3).T, np.float32)
 
     @cached_property
     def _scale(self) -> tuple[AnyArray, np.float32, np.float32, int]:

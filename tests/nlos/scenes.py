@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from nlos import Grid
 from nlos.capture import TimeAxis
+from nlos.plane import Plane
 from nlos.simulate import PointScene
 from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
@@ -41,8 +42,7 @@ FIVE_POINTS = np.array(
 
 def planar_wall(rows=17, columns=21):
     """A wall of 1.2 m x 1 m at z = 0, rows downwards."""
-    x, y = np.meshgrid(np.linspace(-0.6, 0.6, columns), np.linspace(-0.5, 0.5, rows))
-    return np.stack([x, y, np.zeros_like(x)], axis=-1)
+    return Plane(np.linspace(-0.6, 0.6, columns), np.linspace(-0.5, 0.5, rows), 0.0).points
 
 
 def curved_wall(rows=17, columns=21):
@@ -95,12 +95,6 @@ def see_shaped(shape, count, laser=SHAPED_SPOT):
     return see(SHAPED_POINTS, shaped_wall(shape, count), laser, SHAPED_AXIS, SHAPED_JITTER)
 
 
-def voxels_of(grid):
-    """Positions of all voxels, (z, y, x, 3), m."""
-    z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
-    return np.stack([x, y, z], axis=-1)
-
-
 def around(point, half=0.12, voxel=0.04):
     """Voxels about a point, which is the middle one."""
     steps = voxel * np.arange(-round(half / voxel), round(half / voxel) + 1)
@@ -109,7 +103,7 @@ def around(point, half=0.12, voxel=0.04):
 
 def distance_to_nearest(grid, points):
     """From every voxel (z, y, x) to the nearest of some points, m."""
-    return cKDTree(np.asarray(points)).query(voxels_of(grid))[0]
+    return cKDTree(np.asarray(points)).query(grid.points)[0]
 
 
 def energy_fraction(values, near):

@@ -15,7 +15,6 @@ from scenes import (
     planar_wall,
     relative_error,
     see,
-    voxels_of,
 )
 
 from nlos import Backprojection, Capture, FilteredBackprojection, Grid
@@ -79,7 +78,7 @@ def test_weights_are_powers_of_distance_and_direction(falloff, obliquity, captur
     signal[:, 4, 7] = capture.signal[:, 4, 7]
     lone = replace(capture, signal=signal)
     plain, found = (one.phasor_field(lone, GRID).values for one in (METHOD, weighted))
-    away = voxels_of(GRID) - capture.wall[4, 7]
+    away = GRID.points - capture.wall[4, 7]
     distance = np.linalg.norm(away, axis=-1)
     expected = plain * distance ** (1 - falloff) * (away[..., 2] / distance) ** obliquity
     assert np.any(expected)
@@ -102,7 +101,7 @@ def test_all_lasers_of_a_grid_are_summed_as_if_each_were_alone():
 def test_the_laplacian_is_that_of_metres():
     """Of a quadratic volume it is a constant, whatever the voxels' shape."""
     grid = Grid(0.01 * np.arange(41), 0.008 * np.arange(51), 0.005 * np.arange(81))
-    values = (voxels_of(grid) ** 2 @ np.array([3, 5, 7])).astype(np.float32)
+    values = (grid.points**2 @ np.array([3, 5, 7])).astype(np.float32)
     found = _apply_laplacian(values, grid, 0.02)[40, 25, 20]
     # A Gaussian of two to four voxels, sampled: errs by less than a percent.
     assert found == pytest.approx(-(0.02**2) * 2 * (3 + 5 + 7), rel=0.01)

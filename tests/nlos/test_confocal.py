@@ -10,6 +10,7 @@ from scenes import around, find_refusal, relative_error, scaled_error, see
 from nlos import Capture, FKMigration, Grid, LightCone
 from nlos.capture import TimeAxis
 from nlos.confocal import apply_wiener_filter
+from nlos.plane import Plane
 from tofclip.errors import InputError
 
 # Odd and unequal sizes; path per bin about the wall's step.
@@ -23,8 +24,7 @@ named = pytest.mark.parametrize("method", [LightCone(), FKMigration()], ids=["li
 
 
 def wall_at(depth=0.0):
-    x, y = np.meshgrid(X, Y)
-    return np.stack([x, y, np.full_like(x, depth)], axis=-1)
+    return Plane(X, Y, depth).points
 
 
 def confocal(points=(HIDDEN,), wall=None, axis=AXIS):
@@ -138,8 +138,7 @@ def test_what_is_no_confocal_lattice_is_refused(method, wall, laser, reason):
 
 @named
 def test_ten_gigabytes_are_refused_before_they_are_allocated(method):
-    x, y = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-1, 1, 80))
-    wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    wall = Plane(*[np.linspace(-1, 1, 80)] * 2, 0.0).points
     # A record that starts 200 m late has as many empty bins before it.
     capture = Capture(np.zeros((2, 80, 80)), wall, wall, 32e-12, start=200.0)
     grid = Grid.box((0, 0.1), (0, 0.1), (0.5, 0.6), 0.1)

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.linalg import norm
-from scenes import planar_wall, voxels_of
+from scenes import planar_wall
 
 from nlos import Grid, PlanarRSD, Volume
 from nlos.capture import TimeAxis
@@ -89,7 +89,7 @@ def test_what_shows_no_surface_is_refused(volume, fraction, reason):
 def test_a_sphere_has_its_normals():
     """A bright shell about a centre: brightness changes most towards it."""
     centre, radius = CENTRE + np.array([0, 0, 0.15]), 0.3
-    away = voxels_of(GRID) - centre
+    away = GRID.points - centre
     shell = np.exp(-(((norm(away, axis=-1) - radius) / 0.03) ** 2))
     # Only its front half is seen.
     found = find_front_surface(Volume(shell * (away[..., 2] < 0), GRID), 0.5)

@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 
 from nlos import Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
+from nlos.plane import Plane
 from nlos.resolution import compute_diffraction_limit
 from nlos.simulate import add_poisson_noise, build_relay_wall
 
@@ -46,8 +47,7 @@ def test_a_point_is_as_wide_as_diffraction_and_the_pulse_make_it(depth):
 
 def test_the_limit_is_the_width_of_the_sum_that_defines_it():
     """A wide wall, where it matters how light falls with distance."""
-    x, y = np.meshgrid(np.linspace(-1, 1, 41), np.linspace(-1, 1, 41))
-    wall, middle = np.stack([x, y, np.zeros_like(x)], axis=-1), np.array([0.0, 0.0, 0.4])
+    wall, middle = Plane(*[np.linspace(-1, 1, 41)] * 2, 0.0).points, np.array([0.0, 0.0, 0.4])
     capture = see([middle], wall, [0.0, 0.0, 0.0], TimeAxis(200, 60e-12), 60e-12)
     points, pulse = wall.reshape(-1, 3), METHOD.pulse
     distance = norm(points - middle, axis=1)

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import voxels_of
 
 from nlos import Capture, Grid, TransientVideo, Volume
 from nlos.picture import _draw_figure, map_depths
@@ -27,8 +26,8 @@ def ball():
     """A soft ball off the middle, brightest at one voxel, with a complex phase that must not
     matter.
     """
-    away = (voxels_of(FINE) - [0.16, -0.24, 0.52]) / [0.03, 0.04, 0.012]
-    values = np.exp(-np.sum(away**2, axis=-1) + 1j * voxels_of(FINE)[..., 0])
+    away = (FINE.points - [0.16, -0.24, 0.52]) / [0.03, 0.04, 0.012]
+    values = np.exp(-np.sum(away**2, axis=-1) + 1j * FINE.points[..., 0])
     return Volume(values.astype(np.complex64), FINE)
 
 
@@ -291,7 +290,7 @@ def test_the_surface_encloses_the_ball(tmp_path):
     pyvista = pytest.importorskip("pyvista")
     fine = Grid(*(np.linspace(-0.2, 0.2, n) for n in (31, 35, 33)))
     centre = np.array([0.03, -0.02, 0.01])
-    radius = np.linalg.norm(voxels_of(fine) - centre, axis=-1)
+    radius = np.linalg.norm(fine.points - centre, axis=-1)
     mesh = Volume(np.clip(1 - radius / 0.2, 0, None), fine).surface(0.5)
     # Half of the brightest voxel lies at this radius; marching cubes interpolate a cone linearly
     # along edges.
