@@ -126,8 +126,6 @@ class VirtualPlane(Plane):
     A field cut off at the rim would send waves of its own from there, which weaken with the square
     root of the rim's distance only. Faded out as a raised cosine, whose second derivative jumps,
     they weaken with the third power of the fade's width.
-
-    `x, y` (n,): evenly spaced and increasing, m; at least 2 of each.
     """
 
     fade: tuple[float, float] = (0.0, 0.0)  # width of the fade along y and x, m
@@ -245,9 +243,8 @@ class StraightPaths:
     def find(
         cls, points: FloatArray, plane: VirtualPlane, grid: Grid, tolerance: float
     ) -> StraightPaths | None:
-        """Find the straight paths between wall points and voxels through a plane. `points` (n, 3):
-        of the wall, m; `plane`: in front of them; `tolerance`: relative error allowed. Returns none
-        where voxels lie before the plane: no straight path to these crosses it.
+        """Find the straight paths between wall points (n, 3), m, and voxels through a plane before the
+        wall; None where voxels lie before it: no straight path to these crosses it.
         """
         first, last = float(grid.z[0]), float(grid.z[-1])
         if first <= plane.z:

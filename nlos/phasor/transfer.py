@@ -231,15 +231,11 @@ class TransferFunction:
         return node, weight
 
     def evaluate(self, distance: float, delay: FloatArray, leading_zeros: int = 0) -> Float32Array:
-        """Return the transfer function over a distance, shape (nodes, 2, frequencies), real and
-        imaginary parts.
+        """Return the transfer function over a distance, m: real and imaginary parts (nodes, 2,
+        leading_zeros + frequencies).
 
-        A delay (path, k_0) turns every frequency by ``(k - k_0) * path`` besides. A negative
-        distance undoes a positive one, as far as waves travel at all. `leading_zeros` zeros stand
-        before the lowest frequency.
-
-        `delay` (2,): path in m and the wavenumber k_0 in rad/m. Returns (nodes, 2, leading_zeros +
-        frequencies).
+        A delay, path in m and wavenumber k_0 in rad/m, turns every frequency by ``(k - k_0) *
+        path`` besides. A negative distance undoes a positive one, as far as waves travel at all.
         """
         radii, _ = self._radii
         waves = np.zeros((radii.size, 2, leading_zeros + self.waves.count), np.float32)
@@ -273,7 +269,7 @@ def find_lateral_limits(
     weak, and evanescent ones.
 
     `strength` (frequencies,): relative amplitude of each frequency; `distance`: from the sources,
-    along z, m; `error`: allowed, root mean square, relative. Returns (frequencies,).
+    along z, m; `error`: allowed, root mean square, relative.
     """
     # of the window's fall only, not of where it is cut: that lies beyond all targets
     whole = window.without_cut

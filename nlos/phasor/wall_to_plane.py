@@ -222,14 +222,9 @@ def _cover_with_lattice(points: FloatArray, plane: Plane) -> WallLattice:
 
 
 def find_common_period(side: float, wall: float, plane: float, count: int) -> tuple[int, float]:
-    """Return a period of at least `side` in steps of the wall and in steps of the plane.
-
-    Whole numbers of both if there are such, so that Fourier transforms lead there and back; else of
-    the wall's.
-
-    `side`: shortest period, m; `wall, plane`: steps, m; `count`: steps of the plane over which the
-    misfit adds up. Returns `length`: steps of the wall, of a length that Fourier transforms like;
-    `places`: steps of the plane.
+    """Return a period of at least `side`, m, in steps of the wall, as many as Fourier transforms like,
+    and in steps of the plane; whole numbers of both if there are such, so that transforms lead there
+    and back. `wall, plane`: steps, m; `count`: steps of the plane over which the misfit adds up.
     """
     shortest = find_fast_length(side / wall)
     length = shortest

@@ -4,7 +4,6 @@ from numpy.linalg import norm
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
-from tofclip.errors import InputError
 
 AXIS = TimeAxis(bins=300, bin_width=16e-12, start=0.7)
 PULSE = VirtualPulse(0.125, 3)
@@ -48,16 +47,3 @@ def test_phasors_are_the_weighted_fourier_sum_of_their_definition():
     assert single.dtype == np.complex64
     # float32 sums of 300 terms.
     assert norm(single - expected) < 1e-5 * norm(expected)
-
-
-@pytest.mark.parametrize(
-    ("wavelength", "cycles", "message"),
-    [
-        *((wave, 3, "empty band") for wave in (1e-4, 2 * AXIS.spacing)),
-        *((wave, 3, "virtual pulse must be a positive") for wave in (0, -1, np.nan)),
-        *((0.1, cycles, "virtual pulse must be a positive") for cycles in (0, np.inf)),
-    ],
-)
-def test_what_is_no_band_is_refused(wavelength, cycles, message):
-    with pytest.raises(InputError, match=message):
-        Band(VirtualPulse(wavelength, cycles), AXIS)

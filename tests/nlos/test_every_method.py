@@ -233,8 +233,8 @@ def test_a_wall_that_is_too_coarse_is_warned_of_in_one_line(make):
 @pytest.mark.parametrize(
     ("make", "arguments", "message"),
     [
-        *((Backprojection, {"wavelength": wave}, "virtual pulse") for wave in (0, np.nan)),
-        (Hybrid, {"wavelength": 0.1, "cycles": -1}, "virtual pulse"),
+        *((Backprojection, {"wavelength": wave}, "virtual pulse") for wave in (0, -1, np.nan)),
+        *((Hybrid, {"wavelength": 0.1, "cycles": n}, "virtual pulse") for n in (0, -1, np.inf)),
         (Hybrid, {"wavelength": 0.1, "propagation": "fast"}, "unknown propagation"),
         *((PlanarRSD, {"wavelength": 0.1, "tolerance": t}, "tolerance") for t in (0, 1, np.nan)),
         *((FilteredBackprojection, {"sigma": sigma}, "sigma") for sigma in (0, -1, np.nan)),

@@ -17,7 +17,7 @@ from nlos.simulate import (
     build_relay_wall,
 )
 from nlos.simulate.walls import compute_wall_normals
-from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
+from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.units import SPEED_OF_LIGHT
 
 AXIS = TimeAxis(bins=420, bin_width=16e-12, start=0.3)
@@ -259,32 +259,28 @@ def test_counts_have_the_noise_of_photons():
 
 
 @pytest.mark.parametrize(
-    ("build", "error", "message"),
+    ("build", "message"),
     [
-        (lambda: build_relay_wall("chinese", 5), InputError, "choose one of planar, cylinder"),
-        (lambda: build_relay_wall("planar", 1), InputError, "at least 2 x 2"),
-        (lambda: build_relay_wall("planar", 5, -1.0), InputError, "positive width"),
-        (lambda: build_relay_wall("cylinder", 5, 6.0), InputError, "narrower than 6 m"),
-        (lambda: PointScene([[1, 2]]), ShapeError, "hidden points"),
-        (lambda: PointScene([POINT], [1, 2]), ShapeError, "albedo"),
-        (lambda: PointScene([POINT]).simulate_capture(THREE, SPOT, AXIS, 0), InputError, "jitter"),
-        (
-            lambda: HiddenScene([facet()]).simulate_capture(WALL, SPOT, AXIS, 0),
-            InputError,
-            "jitter",
-        ),
-        (lambda: HiddenScene([]), InputError, "needs a surface"),
-        (lambda: Surface.letters(" ", [0, 0, 0.5], 0.4, 0.01), InputError, "no ink"),
-        (lambda: Surface.mesh([[0, 0]], [[0, 1, 2]], 0.1), ShapeError, "vertices and faces"),
-        (lambda: Surface.mesh(np.eye(3), [[0, 1, 3]], 0.1), InputError, "by their index"),
-        (lambda: Surface.mesh(np.eye(3), [[0, 1, 2]], 0), InputError, "positive spacing"),
-        (lambda: Surface.mesh(np.eye(3), [[0, 1, 2]], 1e-4), InputError, "more than 200000 facets"),
-        (lambda: Lambert(1.5), InputError, "albedo"),
-        (lambda: Retroreflector(0.5, 0), InputError, "spread"),
-        (lambda: add_poisson_noise(flat(), 0), InputError, "positive peak"),
-        (lambda: add_poisson_noise(flat(0.0), 5), InputError, "not all dark"),
+        (lambda: build_relay_wall("chinese", 5), "choose one of planar, cylinder"),
+        (lambda: build_relay_wall("planar", 1), "at least 2 x 2"),
+        (lambda: build_relay_wall("planar", 5, -1.0), "positive width"),
+        (lambda: build_relay_wall("cylinder", 5, 6.0), "narrower than 6 m"),
+        (lambda: PointScene([[1, 2]]), "hidden points"),
+        (lambda: PointScene([POINT], [1, 2]), "albedo"),
+        (lambda: PointScene([POINT]).simulate_capture(THREE, SPOT, AXIS, 0), "jitter"),
+        (lambda: HiddenScene([facet()]).simulate_capture(WALL, SPOT, AXIS, 0), "jitter"),
+        (lambda: HiddenScene([]), "needs a surface"),
+        (lambda: Surface.letters(" ", [0, 0, 0.5], 0.4, 0.01), "no ink"),
+        (lambda: Surface.mesh([[0, 0]], [[0, 1, 2]], 0.1), "vertices and faces"),
+        (lambda: Surface.mesh(np.eye(3), [[0, 1, 3]], 0.1), "by their index"),
+        (lambda: Surface.mesh(np.eye(3), [[0, 1, 2]], 0), "positive spacing"),
+        (lambda: Surface.mesh(np.eye(3), [[0, 1, 2]], 1e-4), "more than 200000 facets"),
+        (lambda: Lambert(1.5), "albedo"),
+        (lambda: Retroreflector(0.5, 0), "spread"),
+        (lambda: add_poisson_noise(flat(), 0), "positive peak"),
+        (lambda: add_poisson_noise(flat(0.0), 5), "not all dark"),
     ],
 )
-def test_nonsense_is_refused(build, error, message):
-    with pytest.raises(error, match=message):
+def test_nonsense_is_refused(build, message):
+    with pytest.raises(InputError, match=message):
         build()

@@ -10,7 +10,7 @@ from nlos import Capture, Grid, Hybrid, PlanarRSD, TransientImaging
 from nlos.capture import TimeAxis
 from nlos.method import MEMORY_LIMIT_BYTES
 from nlos.video import DepthAverage, TransientVideo
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError
 from tofclip.units import SPEED_OF_LIGHT
 
 LASER = np.array([0.12, 0.05, 0.0])
@@ -121,41 +121,33 @@ FILM = np.zeros((3, *GRID.shape), np.float32)
 
 
 @pytest.mark.parametrize(
-    ("attempt", "error", "message"),
+    ("attempt", "message"),
     [
-        (
-            lambda c: IMAGING.video(replace(c, laser=c.wall), GRID, ARRIVALS),
-            InputError,
-            "need one laser spot",
-        ),
+        (lambda c: IMAGING.video(replace(c, laser=c.wall), GRID, ARRIVALS), "need one laser spot"),
         (
             lambda c: IMAGING.front_views(c, Grid(GRID.x, GRID.y, GRID.z - 2), ARRIVALS),
-            InputError,
             "behind the hindmost",
         ),
         (
             lambda c: IMAGING.video(c, GRID, np.zeros(MEMORY_LIMIT_BYTES // (4 * GRID.size) + 1)),
-            InputError,
             r"GiB allowed: ask for fewer",
         ),
-        (lambda c: IMAGING.video(c, GRID, []), ShapeError, "instants"),
-        (lambda c: IMAGING.video(c, GRID, [np.nan]), InputError, "must be finite"),
-        (lambda c: IMAGING.image_gate(c, GRID, 2e-9, 1e-9), InputError, "open before it closes"),
+        (lambda c: IMAGING.video(c, GRID, []), "instants"),
+        (lambda c: IMAGING.video(c, GRID, [np.nan]), "must be finite"),
+        (lambda c: IMAGING.image_gate(c, GRID, 2e-9, 1e-9), "open before it closes"),
         (
             lambda _: TransientVideo(np.zeros((2, 3, 3), np.float32), np.zeros(2), GRID),
-            ShapeError,
             "transient video",
         ),
         (
             lambda _: TransientVideo(FILM, np.arange(3.0), GRID).save_film("film.mp4"),
-            InputError,
             r"must end in \.gif",
         ),
-        (lambda _: DepthAverage(GRID, 0.0, 0), InputError, "1 capture or more"),
+        (lambda _: DepthAverage(GRID, 0.0, 0), "1 capture or more"),
     ],
 )
-def test_what_cannot_be_filmed_is_refused(attempt, error, message):
-    with pytest.raises(error, match=message):
+def test_what_cannot_be_filmed_is_refused(attempt, message):
+    with pytest.raises(InputError, match=message):
         attempt(seen("rsd"))
 
 
