@@ -9,7 +9,6 @@ import os
 import secrets
 import tempfile
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from time import monotonic, monotonic_ns, time_ns
 from typing import Any
@@ -71,11 +70,16 @@ class RecordingWriter:
         self._clock_offset_ns = time_ns() - monotonic_ns()
         self._checked_at = monotonic()
         self._head = _render_head(head)
-        with _explain_refusal(path), contextlib.ExitStack() as stack:
-            self._file, temporary = _create_file(path, overwrite, stack)
-            self._append(BlockKind.HEAD, self._head)
-            self._append(BlockKind.HEAD, self._head)
-            _publish(temporary, path, overwrite)
+        try:
+            with contextlib.ExitStack() as stack:
+                self._file, temporary = _create_file(path, overwrite, stack)
+                self._append(BlockKind.HEAD, self._head)
+                self._append(BlockKind.HEAD, self._head)
+                _publish(temporary, path, overwrite)
+        except StorageError:
+            raise
+        except OSError as fault:
+            raise self._explain(fault) from fault
         self._inode = os.fstat(self._file).st_ino
 
     def add(self, piece: Piece) -> None:
@@ -158,16 +162,6 @@ def _render_head(head: Record) -> bytes:
     # its own length says.
     sectors = -(-(len(content) + HEADER_BYTES) // SECTOR_BYTES)
     return content.ljust(sectors * SECTOR_BYTES - HEADER_BYTES, b"\0")
-
-
-@contextlib.contextmanager
-def _explain_refusal(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except StorageError:
-        raise
-    except OSError as fault:
-        raise StorageError(f"{path}: cannot be written: {explain_os_error(fault)}") from fault
 
 
 def _create_file(path: Path, overwrite: bool, stack: contextlib.ExitStack) -> tuple[int, Path]:

@@ -185,7 +185,8 @@ CONFOCAL_LASER = "confocal"
 def read_streak_folder(folder: str | Path) -> Capture:
     """Read a folder's EXR files by the numbers in their names; colours are averaged."""
     folder = Path(folder)
-    files = sorted(folder.glob("*.exr"), key=_parse_file_number)
+    number = lambda file: ([int(digits) for digits in re.findall(r"\d+", file.stem)], file.stem)  # noqa: E731
+    files = sorted(folder.glob("*.exr"), key=number)
     if not files:
         raise FileFormatError(folder, "is a folder without EXR files: no capture")
     rows = [_read_picture(file) for file in files]
@@ -208,10 +209,6 @@ def read_streak_folder(folder: str | Path) -> Capture:
         float(_read_numbers(folder, geometry, name, ())) for name in ("bin_width_ps", "start_m")
     )
     return Capture(signal, wall, laser, bin_width * PICOSECOND, start)
-
-
-def _parse_file_number(path: Path) -> tuple[list[int], str]:
-    return [int(digits) for digits in re.findall(r"\d+", path.stem)], path.stem
 
 
 def _read_picture(path: Path) -> Float32Array:

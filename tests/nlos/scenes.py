@@ -7,7 +7,6 @@ from scipy.spatial import cKDTree
 
 from nlos import Grid
 from nlos.capture import TimeAxis
-from nlos.plane import Plane
 from nlos.simulate import PointScene
 from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
@@ -42,7 +41,8 @@ FIVE_POINTS = np.array(
 
 def planar_wall(rows=17, columns=21):
     """A wall of 1.2 m x 1 m at z = 0, rows downwards."""
-    return Plane(np.linspace(-0.6, 0.6, columns), np.linspace(-0.5, 0.5, rows), 0.0).points
+    x, y = np.meshgrid(np.linspace(-0.6, 0.6, columns), np.linspace(-0.5, 0.5, rows))
+    return np.stack([x, y, np.zeros_like(x)], axis=-1)
 
 
 def curved_wall(rows=17, columns=21):
