@@ -114,17 +114,6 @@ class TestRecord:
         got = Record.load(path)
         assert got.attributes["long"] == got.provenance["history"] == long
 
-    def test_array_checks_name_dimensions_units_and_type(self, record):
-        assert record.array("counts", np.float32, 2, "count").dtype == np.float32
-        for problem, arguments in {
-            "no field 'times'": ("times", np.float32, 1),
-            "must have 3 dimensions": ("counts", np.float32, 3, "count"),
-            "must be in 's', found 'count'": ("counts", np.float32, 2, "s"),
-            "must convert to int32, found float64": ("counts", np.int32, 2, "count"),
-        }.items():
-            with pytest.raises(FileFormatError, match=problem):
-                record.array(*arguments)
-
     def test_attributes_and_children_are_checked(self, record):
         parent = Record("frames", children={"shot": record})
         assert record.attribute("gain") == 2.5
@@ -504,6 +493,7 @@ class TestStorables:
             ({"attributes": {"slit_width_px": "many"}}, "'slit_width_px' must be of type int"),
             ({"fields": {"centres": Field(np.ones(2), "s")}}, "must be in 'px'"),
             ({"fields": {"centres": Field(np.ones((3, 2)), "px")}}, "must have 1 dimension"),
+            ({"fields": {"image_shape": Field(np.ones(2), "px")}}, "must convert to int64, found"),
         ],
     )
     def test_what_is_declared_must_be_there(self, change, message):

@@ -6,19 +6,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import scipy.sparse
 
 from tofclip.camera import Camera, SkewSweep
-from tofclip.errors import InputError
 from tofclip.lidar.pulse import TraceBins
-from tofclip.lidar.signal_rows import BrightFrameFinder, RowBlock, SignalRowFinder
-from tofclip.operators.sparse import Tiles
+from tofclip.lidar.signal_rows import RowBlock, SignalRowFinder
 from tofclip.recovery import DepthLockedFocus, FixedFocus
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_checkerboard
 from tofclip.solvers import LinearInverse
-from tofclip.solvers.direct import GROUP_PIXELS, InverseTraces, order_by_patch
+from tofclip.solvers.direct import InverseTraces, order_by_patch
 from tofclip.threads import LANES
 
 CENTRES = 30.0 + 45 * np.arange(5)
@@ -155,43 +152,3 @@ def test_returns_are_those_of_all_rows(focus, monkeypatch):
         # pulse
         np.testing.assert_allclose(np.median(np.abs(some.range - everything.range)), 0, atol=1e-6)
         np.testing.assert_allclose(some.intensity, everything.intensity, rtol=0.05)
-
-
-NARROW = (21, 37)
-
-
-def narrow_camera(dead=None):
-    """Of three views, of which the first two overlap."""
-    angles, dead_columns = np.radians([-40.0, 5.0, 35.0]), np.arange(170) == dead
-    return Camera(np.array([30.0, 52.4, 140.2]), angles, NARROW, 170, dead_columns=dead_columns)
-
-
-def filter_responses(matrix, block):
-    """Largest response of the matched filter in each frame."""
-    length = np.linalg.norm(matrix, axis=0)
-    return (matrix.T @ block / np.where(length > 0, length, 1)[:, np.newaxis]).max(axis=0)
-
-
-@pytest.mark.parametrize("limit", [2.5, 3.5, 4.5])
-@pytest.mark.parametrize("light", [0.0, 12.0])
-def test_bright_frames_are_those_of_the_whole_filter(limit, light):
-    operator = narrow_camera().operator()
-    tiles = InverseTraces(LinearInverse().prepare(operator), order_by_patch(NARROW)).tiles
-    random = np.random.default_rng(3)
-    block = random.standard_normal((170, 8 * LANES)).astype(np.float32)
-    matrix = operator.matrix.toarray()
-    for frame in range(0, block.shape[1], 3):
-        column = matrix[:, random.integers(matrix.shape[1])]
-        block[:, frame] += light * random.random() * column / max(np.linalg.norm(column), 1)
-    # more than a word of frames, and not whole ones
-    span = slice(LANES, 6 * LANES)
-    expected = filter_responses(matrix, block)[span]
-    assert np.abs(expected - limit).min() > 1e-5
-    bright = BrightFrameFinder(tiles, 170, GROUP_PIXELS).find(block, span, limit)
-    np.testing.assert_array_equal(bright, expected >= limit)
-
-
-def test_negative_entries_are_refused():
-    matrix = scipy.sparse.csr_array(np.array([[1.0, -1.0]], np.float32))
-    with pytest.raises(InputError, match="negative entries"):
-        BrightFrameFinder(Tiles.from_csr(matrix), 2, GROUP_PIXELS)
