@@ -26,7 +26,7 @@ from tofclip.files import MAX_UNPACKED_BYTES, find_array_limit, require_bounded_
 from tofclip.io import read_streak
 from tofclip.io.light_fields import read_light_field
 from tofclip.io.streaks import StreakStack, outline_streak_file
-from tofclip.lidar.photons.files import read_photons
+from tofclip.lidar.photons.files import describe_photons, read_photons
 
 HUGE = 1 << 29
 ROOM_BYTES = 16 << 20
@@ -66,6 +66,19 @@ def write_tiff_bomb(folder):
     with tifffile.TiffFile(path, mode="r+") as tiff:
         for name in ("ImageLength", "ImageWidth", "RowsPerStrip"):
             tiff.pages.first.tags[name].overwrite(1 << 14)
+    return path
+
+
+def write_circle(folder):
+    """Pages of which the last one says that the first comes next: readers were busy for ever."""
+    path = folder / "circle.tif"
+    tifffile.imwrite(path, np.ones((3, 4, 5), np.uint8), photometric="minisblack", metadata=None)
+    with tifffile.TiffFile(path) as tiff:
+        first, last = tiff.pages[0].offset, tiff.pages[-1]
+        link = last.offset + 2 + 12 * len(last.aspage().tags)
+    content = bytearray(path.read_bytes())
+    content[link : link + 4] = first.to_bytes(4, "little")
+    path.write_bytes(content)
     return path
 
 
@@ -184,6 +197,8 @@ BOMBS = {
     "lzma": (write_lzma_bomb, read_streak),
     "tiff": (write_tiff_bomb, read_streak),
     "tiff outline": (write_tiff_bomb, outline_streak_file),
+    "circle": (write_circle, read_streak),
+    "circle of photons": (write_circle, describe_photons),
     "table": (write_table_bomb, read_streak),
     "tal": (write_tal_bomb, read_capture),
     "external data": (partial(write_tal_bomb, external=True), read_capture),
@@ -204,7 +219,7 @@ BOMBS = {
 def test_a_file_that_claims_more_than_it_can_hold_is_refused(name, tmp_path):
     write, read = BOMBS[name]
     path = write(tmp_path)
-    told = r"^[^\n]*(claims|fit into|is missing|never uses|other files|links)[^\n]*$"
+    told = r"^[^\n]*(claims|circle|fit into|is missing|never uses|other files|links)[^\n]*$"
     tracemalloc.start()
     try:
         with pytest.raises(FileFormatError, match=told):

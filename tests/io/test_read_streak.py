@@ -1,7 +1,6 @@
 """Every format through the one door, and everything that must not pass it."""
 
 import hashlib
-import struct
 
 import numpy as np
 import pytest
@@ -112,16 +111,6 @@ def break_off(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def close_in_a_circle(path):
-    tifffile.imwrite(path, np.ones((20, 30), np.uint16))
-    with tifffile.TiffFile(path) as tiff:
-        page, layout = tiff.pages.first, tiff.tiff
-        next_at = page.offset + layout.tagnosize + len(page.tags) * layout.tagsize
-    content = bytearray(path.read_bytes())
-    struct.pack_into("<I", content, next_at, page.offset)
-    path.write_bytes(content)
-
-
 def write_frames(path):
     camera, values = Camera([5.0], [0.0], (3, 4), 10), np.ones((2, 3, 4), np.float32)
     Frames(values, np.array([0.0, 1e-12]), camera).to_record().save(path.with_suffix(".h5"))
@@ -133,7 +122,6 @@ def write_frames(path):
     [
         (claim_too_much, FileFormatError, "claims an impossible size"),
         (break_off, FileFormatError, "is truncated: its picture 32 is missing"),
-        (close_in_a_circle, FileFormatError, "circle"),
         (write_frames, FileFormatError, "holds a frames record, expected streak"),
         (lambda path: None, StorageError, r"shot\.tif: no such file"),
         (lambda path: path.mkdir(), StorageError, "is a folder"),

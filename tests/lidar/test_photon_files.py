@@ -258,19 +258,6 @@ def test_what_has_no_suitable_layout_is_told_which_would_do(tmp_path):
     assert describe_photons(tmp_path / "flat.npy")["arrays"] == {"array": "3 x 4 float64"}
 
 
-def test_pages_in_a_circle_are_refused(tmp_path):
-    """A damaged link from the last page back to the first kept the reader busy for ever."""
-    path = tmp_path / "circle.tif"
-    tifffile.imwrite(path, np.ones((3, 4, 5), np.uint8), photometric="minisblack", metadata=None)
-    with tifffile.TiffFile(path) as tiff:
-        first, last = tiff.pages[0].offset, tiff.pages[-1]
-        link = last.offset + 2 + 12 * len(last.aspage().tags)
-    content = bytearray(path.read_bytes())
-    content[link : link + 4] = first.to_bytes(4, "little")
-    path.write_bytes(content)
-    refuse(path, "in a circle", describe_photons)
-
-
 def test_a_chunk_that_is_larger_than_its_cube_is_refused(tmp_path):
     """A file of a megabyte had a gigabyte unpacked for a few bins."""
     path, chunk = tmp_path / "chunk.h5", (1, 1, 1 << 25)
