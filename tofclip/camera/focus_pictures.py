@@ -67,28 +67,15 @@ def calibrate_views(
     dot_background: ArrayLike,
     views: int = 7,
 ) -> FocusCalibration:
-    """Find each view's slit centre and line angle.
+    """Find slit centre and line angle of each of so many `views` from pictures of a point source: `line`, with
+    the slit open, and `dot`, with it closed, and of each the same without the source, `line_background`
+    and `dot_background`.
 
     A centre is the middle of a Gaussian fitted to the core of the dot's profile along the slit; its
     uncertainty comes from the fit. An angle is that of the line's principal axis (total least
     squares weighted by brightness); its uncertainty comes from the scatter of the line's segments
-    about it, so that a bent line counts as an uncertain one.
-
-    Parameters
-    ----------
-    line, line_background : (rows, columns) array
-        Point source with the slit open, and the same without the source.
-    dot, dot_background : (rows, columns) array
-        The same with the slit closed.
-    views : int
-        Number of lenslets.
-
-    Raises
-    ------
-    ShapeError
-        The four pictures differ in shape.
-    CalibrationError
-        Fewer dots than views stand out, or a dot lies on no line.
+    about it, so that a bent line counts as an uncertain one. `ShapeError` where the pictures differ in
+    shape, `CalibrationError` where fewer dots than views stand out, or a dot lies on no line.
     """
     signal = _subtract_background(line, line_background)
     dots = _subtract_background(dot, dot_background)

@@ -29,36 +29,19 @@ def empty_array(units: str, *axes: str, **options: Any) -> Any:
 
 @dataclass(frozen=True)
 class RangeCalibration(Storable):
-    """Corrections of ranges and intensities, each with its standard deviation.
+    """Corrections of ranges and intensities, each with its standard deviation; arrays are empty where nothing
+    is known.
 
-    Parameters
-    ----------
-    time_zero_sigma : float
-        One standard deviation of the camera's time zero, s.
-    walk : (order,) array
-        Range walk: what is measured too long, as the coefficients a_1, a_2... of
-        ``sum a_n log10(signal / reference_signal)^n``, m. Empty where it is not known.
-    walk_covariance : (order, order) array
-        Of these coefficients, m^2.
-    reference_signal : float
-        Counts of a return for which time zero holds as it is.
-    signal_range : (2,) array
-        Weakest and strongest return of the calibration, counts; beyond, the walk is that of the
-        nearer one.
-    offsets, offset_sigma : (rows, columns) array
-        Range offset of each pixel and its standard deviation, m. Empty where not known.
-    response : (rows, columns) array
-        Relative brightness of each pixel, 1 on average. Empty where not known.
-    reflectance_scale : float
-        Reflectance, percent, of a surface that faces the camera and returns one count from 1 m; NaN
-        where not known.
-    reflectance_scale_sigma : float
-        Its relative standard deviation.
-
-    Raises
-    ------
-    CalibrationError
-        Arrays disagree in shape, or a number is not finite or not positive where it has to be.
+    `time_zero_sigma` is that of the camera's time zero, s. `walk` (order,) is the range walk, what is
+    measured too long: coefficients a_1, a_2... of ``sum a_n log10(signal / reference_signal)^n``, m, of
+    covariance `walk_covariance` (order, order), m^2. Time zero holds as it is for a return of
+    `reference_signal` counts; beyond the weakest and the strongest return of the calibration,
+    `signal_range` (2,), counts, the walk is that of the nearer one. `offsets` and `offset_sigma` (rows,
+    columns) are each pixel's, m, and `response` (rows, columns) its relative brightness, 1 on average.
+    `reflectance_scale` is the reflectance, percent, of a surface that faces the camera and returns one
+    count from 1 m, of relative deviation `reflectance_scale_sigma`; NaN where not known.
+    `CalibrationError` where arrays disagree in shape, or a number is not finite or not positive where it
+    has to be.
     """
 
     RECORD_KIND = "range_calibration"

@@ -161,28 +161,16 @@ def register_views(
     times: FloatArray | None = None,
     max_rounds: int = MAX_ROUND_COUNT,
 ) -> Registration:
-    """Refine a camera whose sweep is a `SkewSweep`.
+    """Refine a camera whose sweep is a `SkewSweep`, known coarsely: centres within a few pixels, skew within
+    a few rows; by a raw streak image, `counts` (rows, columns), and what of it is `saturated`.
 
     Of a camera that knows its lenslet pitch, every instant is modelled at the shear of its range:
     surfaces at several ranges then agree about the centres. A shift of all centres alike, or in
     proportion to tan(angle), only shifts the pictures, and no shot can tell; there the camera's own
-    centres hold.
-
-    Parameters
-    ----------
-    counts : (rows, columns) array
-        Raw streak image.
-    saturated : (rows, columns) bool array or None
-    camera : Camera
-        Coarse calibration: centres within a few pixels, skew within a few rows.
-    progress : callable
-        Called with the number of frame iterations just done.
-    times : (rows,) array, optional
-        Times of flight of the rows, s. Without them, the centres of a camera that knows its lenslet
-        pitch stay as they are.
-    max_rounds : int
-        Refinements at most. Two leave a tenth of the first misfit's excess: enough to read what is
-        written on a surface, not to measure.
+    centres hold. Without `times` (rows,), times of flight of the rows, s, the centres of such a camera
+    stay as they are. Of the refinements, `max_rounds` at most, two leave a tenth of the first misfit's
+    excess: enough to read what is written on a surface, not to measure. `progress` is called with the
+    number of frame iterations just done.
     """
     start, residuals, best, moved_px = camera, [], (np.inf, camera), np.inf
     for number in range(max_rounds + 1):

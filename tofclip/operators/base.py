@@ -39,25 +39,12 @@ REAL_TYPES = (np.dtype(np.float32), np.dtype(np.float64))
 
 
 class LinearOperator(ABC):
-    """A linear map between real arrays of fixed shapes.
+    """A linear map between real arrays of fixed shapes, `shape_in` and `shape_out` without the batch axis;
+    inputs are converted to its `dtype`, float32 or float64, which results have.
 
     Subclasses write `_forward` and `_adjoint`, which get a block of the operator's own type with
     the batch as last axis, and return one: of NumPy's arrays a contiguous one, and of other
-    libraries' only what says it is `portable`.
-
-    Parameters
-    ----------
-    shape_in, shape_out : tuple of int
-        Shapes without the batch axis.
-    dtype : dtype
-        float32 or float64; inputs are converted to it, results have it.
-
-    Attributes
-    ----------
-    portable : bool
-        Whether arrays of any library are taken, or NumPy's only.
-    parts : tuple of LinearOperator
-        Those that this one is made of, if it is.
+    libraries' only what says it is `portable`. `parts` are the operators that this one is made of.
     """
 
     portable = False

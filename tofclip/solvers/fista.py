@@ -194,16 +194,11 @@ NORM_MARGIN = 1.02  # 15 Lanczos iterations may lack so much of the norm; a test
 class ProximalMethod(Method):
     """FISTA with a prior; what the prior is, subclasses say.
 
-    Parameters
-    ----------
-    weight : float
-        Regularisation relative to the largest value of ``A'f`` over all frames. At 1 the sparsest
-        solution, zero, is reached; the scale of the measurements does not matter.
-    iterations, tolerance, gap, further, noise_fall : int or float
-        When a block of frames is done, see `StoppingRule`. What a block is depends on the arrays
-        (`Blocks`), and with it when its frames are done.
-    data_term : DataTermMaker
-        What a misfit costs.
+    Its `weight` is relative to the largest value of ``A'f`` over all frames: at 1 the sparsest solution,
+    zero, is reached; the scale of the measurements does not matter. `iterations`, `tolerance`, `gap`,
+    `further` and `noise_fall` say when a block of frames is done, see `StoppingRule`; what a block is
+    depends on the arrays (`Blocks`), and with it when its frames are done. `data_term` is what a misfit
+    costs.
     """
 
     weight: float
