@@ -36,24 +36,11 @@ class Measurement:
 def measure(
     counts: Float32Array, saturated: BoolArray | None, camera: Camera, dark: float | None = None
 ) -> Measurement:
-    """Subtract the dark level and rectify the sweep.
-
-    Parameters
-    ----------
-    counts : (rows, columns) array
-        Raw streak image, rows = time.
-    saturated : (rows, columns) bool array or None
-    camera : Camera
-        Its sweep says where each rectified pixel lies; without one the rows are taken as they are.
-    dark : float, optional
-        Dark level in counts; by default `estimate_dark_level` of the picture.
-
-    Raises
-    ------
-    CalibrationError
-        The picture is not as wide as the camera's slit.
-    InputError
-        Nothing remains above the dark level, or no measurement can be trusted.
+    """Subtract the dark level from raw `counts` (rows, columns), rows being time, and rectify the sweep of
+    `camera`; without one the rows are taken as they are. What is `saturated` (rows, columns) is not
+    trusted; `dark` is a level in counts, by default `estimate_dark_level` of the picture.
+    `CalibrationError` where the picture is not as wide as the camera's slit, `InputError` where nothing
+    remains above the dark level, or no measurement can be trusted.
     """
     return Rectifier(camera, counts.shape[0]).measure(counts, saturated, dark)
 

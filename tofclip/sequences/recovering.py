@@ -151,30 +151,12 @@ FRAMES_SUFFIX = ".h5"
 
 @dataclass(frozen=True)
 class RecoverySettings:
-    """How a shot becomes frames.
-
-    Parameters
-    ----------
-    method : str
-        A name that `tofclip.recovery.make_method` knows.
-    iterations, weight : int and float, optional
-        Of the method; its own by default.
-    focus : str
-        As `tofclip.recovery.parse_focus` reads it.
-    camera : Path, optional
-        By default each shot carries its own.
-    time_zero : float, optional
-        Reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
-    device : str
-        Where, by a name that `tofclip.arrays.parse_device` knows; each worker of a cluster looks
-        for it anew.
-    own : mapping of str to str
-        Further settings of the method, as `tofclip.recovery.make_method` takes them.
-
-    Raises
-    ------
-    InputError
-        No such method or focus, or the method has no such settings.
+    """How a shot becomes frames: by a `method` that `tofclip.recovery.make_method` knows, with `iterations`,
+    `weight` and further settings of its `own`, its usual ones by default; a `focus`, as
+    `tofclip.recovery.parse_focus` reads it; a `camera`, by default the one that each shot carries, with a
+    `time_zero`, reading of the time axis at which light of range 0 would arrive, s, by default its own; on
+    a `device`, by a name that `tofclip.arrays.parse_device` knows, for which each worker of a cluster looks
+    anew. `InputError` for no such method or focus, or settings that the method has not.
     """
 
     method: str = DEFAULT_METHOD
@@ -278,27 +260,12 @@ DEPTH_IMAGE_SUFFIX = ".exr"
 
 @dataclass(frozen=True)
 class CloudSettings:
-    """How frames become a cloud.
-
-    Parameters
-    ----------
-    drop_outliers : bool
-        Leave out points far from their neighbours.
-    voxel : float, optional
-        One point for each cube of this side, m; all points by default.
-    device : str
-        Where returns are looked for, by a name that `tofclip.arrays.parse_device` knows.
-    returns : str
-        Which return of a pixel: ``"first"``, ``"strongest"``, ``"last"`` or ``"all"``.
-    organised : bool
-        Files have a place for every pixel of the picture, see `tofclip.lidar.cloud`.
-    false_alarm : float, optional
-        See `tofclip.depth`.
-
-    Raises
-    ------
-    InputError
-        An organised cloud is to have all returns, or one point for each of some cubes.
+    """How frames become a cloud: whether points far from their neighbours are left out (`drop_outliers`); the
+    side of cubes with one point each (`voxel`), m, all points by default; the `device` on which returns
+    are looked for, as `tofclip.arrays.parse_device` knows it; which `returns` of a pixel, ``"first"``,
+    ``"strongest"``, ``"last"`` or ``"all"``; whether files have a place for every pixel of the picture
+    (`organised`, see `tofclip.lidar.cloud`); and `false_alarm`, see `tofclip.depth`. `InputError` where an
+    organised cloud is to have all returns, or one point for each of some cubes.
     """
 
     drop_outliers: bool = False

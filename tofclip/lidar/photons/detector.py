@@ -334,29 +334,14 @@ class PhotonDetector:
         cycles: int | None = None,
         dead_bins: int | None = None,
     ) -> Arrivals:
-        """Find the returns of every histogram, below a bin.
+        """Find the returns of every one of the `histograms` (n, bins), below a bin.
 
-        Parameters
-        ----------
-        histograms : (n, bins) array
-            Photons counted in each bin.
-        seed : int
-            Of the chance that decides scores exactly at the threshold.
-        cycles : int, optional
-            Laser cycles that made a histogram, of a detector that is blind after a photon: pile-up
-            is corrected, and what it costs is in the deviations. Without, no photon was missed.
-        dead_bins : int, optional
-            See `correct_pile_up`.
-
-        Raises
-        ------
-        ShapeError, InputError
-            Histograms of another length, with counts that are negative or not finite, or with more
-            photons than the cycles allow.
-
-        Notes
-        -----
-        Memory beyond the result is one float64 copy of the histograms, with pile-up three.
+        The chance that decides scores exactly at the threshold is that of a `seed`. With the laser
+        `cycles` that made a histogram, of a detector that is blind after a photon for `dead_bins` (see
+        `correct_pile_up`), pile-up is corrected, and what it costs is in the deviations; without, no
+        photon was missed. Memory beyond the result is one float64 copy of the histograms, with pile-up
+        three. `ShapeError` or `InputError` for histograms of another length, with counts that are negative
+        or not finite, or with more photons than the cycles allow.
         """
         counts = np.ascontiguousarray(histograms, dtype=np.float64)
         if counts.ndim != 2 or counts.shape[1] != self.bins:
@@ -474,32 +459,15 @@ def estimate_pixels(
     cycles: int | None = None,
     max_returns: int = 1,
 ) -> SurfaceImage:
-    """Find the strongest returns of every pixel by its own photons alone.
+    """Find the strongest returns of every pixel by its own `photons` alone, `max_returns` at most: NaN where
+    none stands out, and in hot pixels. The probability of an outlier is that of a false alarm.
 
-    Parameters
-    ----------
-    photons : PhotonImage
-    pulse : Pulse, optional
-        Shape of a return; by default as wide as pairs of photons say.
-    false_alarm_rate : float
-        Share of the pixels without a return in which one is announced; see `PhotonDetector`.
-    background : (bins,) array, optional
-        Shape of the background over the bins, as of a dark frame; by default what the pixels have
-        in common.
-    cycles : int, optional
-        Laser cycles of each pixel, of a detector that counts the first photon of a cycle only.
-    max_returns : int
-        Returns looked for in every pixel.
-
-    Returns
-    -------
-    SurfaceImage
-        NaN where no return stands out, and in hot pixels. The probability of an outlier is that of a false alarm.
-
-    Raises
-    ------
-    InputError
-        No pulse is given and none can be recognised, or the time axis is shorter than two pulses.
+    `pulse` is the shape of a return, by default as wide as pairs of photons say; `false_alarm_rate` the
+    share of the pixels without a return in which one is announced, see `PhotonDetector`; `background`
+    (bins,) its shape over the bins, as of a dark frame, by default what the pixels have in common;
+    `cycles` the laser cycles of each pixel, of a detector that counts the first photon of a cycle only.
+    `InputError` where no pulse is given and none can be recognised, or the time axis is shorter than two
+    pulses.
     """
     counted = photons
     # a background that is given has the photons' own bins
