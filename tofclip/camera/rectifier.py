@@ -8,12 +8,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import BoolArray, Float32Array, IndexArray, IntArray
+from tofclip.arrays import BoolArray, Float32Array, FloatArray, IndexArray, IntArray
 from tofclip.camera.model import Camera
 from tofclip.errors import CalibrationError, require, require_shape
 from tofclip.threads import run_blocks, split_blocks
+from tofclip.units import MAD_TO_SIGMA
 
 DARK_ROW_FRACTION = 0.05
+# Deviations within which readings of the dark lie, of whole counts half of one at least: what is brighter
+# is light that comes in quiet rows as well
+DARK_SIGMAS, LEAST_SPREAD_COUNT = 3.5, 0.5
 ROWS_PER_BLOCK = 64
 NO_LIGHT_MESSAGE = "nothing rises above the dark level; was there any light?"
 
@@ -56,15 +60,35 @@ def require_width(counts: Float32Array, camera: Camera) -> None:
 
 
 def estimate_dark_level(counts: Float32Array) -> float:
-    """Median of the quietest rows of `counts`, (rows, columns).
+    """Mean of the quietest rows of `counts`, (rows, columns), without what is far off, as hot pixels.
 
     Taken from whole rows, before or after the light came, so that it stays where the
-    measurements scatter about it: the least value of a picture would turn noise into an offset.
+    measurements scatter about it: the least value of a picture would turn noise into an offset, and so
+    would the median of few photons, which is a whole number of them. Of every other column in rows where
+    the columns between are as dark as in the quietest: rows chosen by their own noise would be too dark.
     """
-    quiet, _ = part_quiet_rows(counts)
-    # the median, which NumPy looks for ten times as long as it sorts
-    ordered = np.sort(counts[quiet], axis=None)
-    return float((ordered[(ordered.size - 1) // 2] + ordered[ordered.size // 2]) / 2)
+    halves = (counts[:, ::2], counts[:, 1::2]) if counts.shape[1] > 1 else (counts, counts)
+    means = [half.mean(axis=1, dtype=np.float64) for half in halves]
+    levels = [_average_dark(half, *means[::way]) for half, way in zip(halves, (1, -1), strict=True)]
+    return float(np.mean(levels))
+
+
+def _average_dark(counts: Float32Array, own: FloatArray, beside: FloatArray) -> float:
+    """Mean of rows that are dark by the mean of the columns `beside`, (rows,)."""
+    # without noise there is nothing else by which a row is known to be lit
+    quiet = np.lexsort((own, beside))[: _count_quiet_rows(counts)]
+    level = np.median(counts[quiet])
+    spread = max(MAD_TO_SIGMA * np.median(np.abs(counts[quiet] - level)), LEAST_SPREAD_COUNT)
+
+    def average(rows: IndexArray | BoolArray) -> float:
+        dark = counts[rows]
+        return float(
+            np.mean(dark, where=np.abs(dark - level) <= DARK_SIGMAS * spread, dtype=np.float64)
+        )
+
+    alike = beside <= average(quiet) + spread / np.sqrt(counts.shape[1])
+    alike[quiet] = True
+    return average(alike)
 
 
 def part_quiet_rows(counts: Float32Array) -> tuple[IndexArray, IndexArray]:
@@ -73,8 +97,12 @@ def part_quiet_rows(counts: Float32Array) -> tuple[IndexArray, IndexArray]:
     row_sums = counts @ np.ones(counts.shape[1], np.float32)
     # Rows, not pixels: choosing the darkest pixels would choose those whose noise is low.
     order = np.argsort(row_sums)
-    number = max(1, round(DARK_ROW_FRACTION * row_sums.size))
+    number = _count_quiet_rows(counts)
     return order[:number], order[number:]
+
+
+def _count_quiet_rows(counts: Float32Array) -> int:
+    return max(1, round(DARK_ROW_FRACTION * len(counts)))
 
 
 class Rectifier:
