@@ -139,6 +139,22 @@ def test_leaves_are_kept_in_little_light():
     assert score["false"] < 0.015
 
 
+def test_light_of_a_floor_that_is_not_found_is_told():
+    """Of which a pixel spans 50 to 300 mm: in each frame it is a thin dim line."""
+    wall = plate("wall", (0, -0.82, 4.2), (5, 2.36), 0.5)  # ends where the floor does
+    floor = plate("floor", (0, 0.36, 3.0), (6, 5), 0.5, 0.0, np.pi / 2)
+    light = []
+    for things in ([wall], [wall, floor]):
+        shot = make_shot(things, seed=1, size=48)
+        light.append(float((shot.counts - 2).sum()))
+        frames, score = recover_shot(shot, shot.true_camera)
+        told = frames.figures.get("unexplained_light")
+        assert score["false"] < 0.005
+        if floor not in things:
+            assert told is None
+    assert told == pytest.approx(1 - light[0] / light[1], abs=0.02)
+
+
 def test_a_pulse_is_as_short_as_the_shot_shows_it():
     """A camera that was told no pulse has 60 ps, five times as long as some instruments': surfaces left
     41 % unexplained, and the shot was called smoke.

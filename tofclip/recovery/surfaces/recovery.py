@@ -19,7 +19,7 @@ from tofclip.recovery.surfaces.fit import (
     START_ITERATIONS,
     fit_surfaces,
 )
-from tofclip.recovery.surfaces.model import SurfaceModel, compare_smoothed
+from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, Image
 from tofclip.recovery.surfaces.returns import list_returns
 from tofclip.recovery.surfaces.start import call_dark, estimate_darkness
@@ -27,9 +27,9 @@ from tofclip.shots import Frames, Streak
 from tofclip.solvers import Method, Progress, Sparse, TotalVariation, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
 
-# Of the light, noise aside: what is left of shots that are as the model says is up to 0.07, of those with
-# light reflected twice, a halo or a dark level that rises 0.11 to 0.21.
-MUCH_UNEXPLAINED = 0.1
+# Of the light: what is left of shots that are as the model says is up to 0.03, of those with a floor that is
+# too steep for frames 0.15 or more, and of ones so dark that a wall is not found 0.17 to 0.4.
+MUCH_UNEXPLAINED = 0.05
 NO_SHARES = Detection(min_scene_fraction=0.0, min_time_bin_fraction=0.0, min_pixel_fraction=0.0)
 
 
@@ -120,10 +120,11 @@ class SurfaceRecovery:
             measure(image, unknown, model.camera, 0.0) for image in (rendered, model.image)
         )
         started = {name: one for name, one in frames.figures.items() if name != "duality_gap"}
-        unexplained = compare_smoothed(rendered, model.image, ~unknown)
-        left = unexplained**2 - estimate_darkness(streak, frames) ** 2
-        if left > MUCH_UNEXPLAINED**2:
-            started["unexplained_light"] = float(np.sqrt(left))
+        light, explained = (
+            float(np.sum(image[~unknown], dtype=np.float64)) for image in (model.image, rendered)
+        )
+        if light - explained > MUCH_UNEXPLAINED * light:
+            started["unexplained_light"] = 1 - explained / light
         error = np.linalg.norm((predicted.values - measured.values)[measured.valid])
         distance = SPEED_OF_LIGHT * np.maximum(frames.times / 2, frames.bin_width)
         return replace(
