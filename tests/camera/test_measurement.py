@@ -85,19 +85,6 @@ def test_light_in_a_single_row_is_light(row):
     assert np.count_nonzero(measured) == 1
 
 
-def test_a_skew_is_undone():
-    rows, column = np.arange(ROWS, dtype=float)[:, np.newaxis], np.arange(WIDTH)
-    delay = 4.0 * (column - 15) / 30  # 0 rows at the first view's centre, 4 at the second's
-    counts = np.exp(-((rows - 40 - delay) ** 2) / (2 * 6.0**2)).astype(np.float32)
-    measured = measure(counts, None, camera(sweep=skew(0.0, 4.0)), dark=0.0)
-    expected = np.broadcast_to(np.exp(-((rows - 40) ** 2) / (2 * 6.0**2)).T, (WIDTH, ROWS))
-    inside = measured.valid
-    # Linear interpolation of a Gaussian is off by at most max|f''| / 8 = 1 / (8 * 36).
-    np.testing.assert_allclose(measured.values[inside], expected[inside], atol=1 / 288)
-    assert not inside[-1, -6:].any()  # the late view's last instants lie beyond the picture
-    assert inside[15].all()
-
-
 def test_what_touches_a_saturated_pixel_and_dead_columns_are_masked():
     saturated = np.zeros((ROWS, WIDTH), bool)
     saturated[40, 20] = True

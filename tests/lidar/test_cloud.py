@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +27,6 @@ from tofclip.lidar import (
     PointCloud,
     Returns,
     compute_ray_directions,
-    export,
     point_cloud,
     save_depth,
 )
@@ -232,23 +230,6 @@ def test_unknown_formats_and_places_are_refused(cloud, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, module, None)
         with pytest.raises(MissingDependencyError, match=rf"tofclip\[{extra}\]"):
             cloud.save(tmp_path / f"absent{suffix}")
-
-
-def test_saving_is_all_or_nothing(cloud, tmp_path, monkeypatch):
-    path = tmp_path / "scene.ply"
-    cloud.save(path)
-    before = path.read_bytes()
-
-    def interrupted(file, *_):
-        file.write_bytes(b"half")
-        raise KeyboardInterrupt
-
-    monkeypatch.setitem(export.FORMATS, ".ply", (interrupted, interrupted))
-    with pytest.raises(KeyboardInterrupt):
-        make_cloud(9, 1).save(path)
-    assert path.read_bytes() == before
-    assert [item.name for item in tmp_path.iterdir()] == ["scene.ply"]
-    assert stat.S_IMODE(path.stat().st_mode) & stat.S_IRUSR
 
 
 def test_files_say_their_units_and_numpy_reads_them(cloud, tmp_path):

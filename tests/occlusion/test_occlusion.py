@@ -50,16 +50,6 @@ def make_plate(width, height, z, x=0.0):
     )
 
 
-@pytest.mark.parametrize(
-    ("width", "distance", "length"),
-    [(6, 50, 33.3), (10, 40, 80.0)],  # supplement Note 10
-)
-def test_the_papers_examples(width, distance, length):
-    found = InactiveRegion(15e-3, 1e-3 * width, 1e-3 * distance)
-    assert found.length == pytest.approx(1e-3 * length, rel=2e-3)
-    assert found.is_bounded
-
-
 @given(
     baseline=st.floats(5, 30),
     share=st.floats(0.05, 1.6),

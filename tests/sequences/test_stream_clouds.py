@@ -1,4 +1,6 @@
-"""Shots to clouds while they come, against the same shots one by one; and each shot begun at the last."""
+"""Shots to clouds while they come, against the same shots one by one; each shot begun at the last; and
+histograms that come live: sums of what drifts are true, and so are gates in coarse steps.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -7,10 +9,14 @@ from time import monotonic, sleep
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
+from devices.frames import GatedOptions
+from devices.transients import _make_gate_response
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
-from tofclip.lidar import depth, point_cloud
+from tofclip.lidar import Pulse, depth, point_cloud
+from tofclip.lidar.photons import PhotonCube
 from tofclip.lidar.pulse import TraceBins
 from tofclip.recovery import DepthLockedFocus, recover
 from tofclip.sequences import make_pipeline
@@ -20,6 +26,7 @@ from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_plain_pattern
 from tofclip.solvers import Sparse
+from tofclip.units import SPEED_OF_LIGHT
 
 CENTRES = 30.0 + 45 * np.arange(4)
 
@@ -301,3 +308,59 @@ def test_a_row_begins_at_its_own_picture_whatever_rows_were_lit_before():
         # twelve iterations from darkness, or from another row's picture, are far from it
         truth = scene[..., new].ravel()
         assert np.linalg.norm(found[new] - truth) > 0.3 * np.linalg.norm(truth)
+
+
+ROWS, COLUMNS = np.indices((32, 32))
+BIN, SIGMA = 250e-12, 300e-12  # s
+
+
+def take_shot(ranges, signal, seed):
+    edges = BIN * np.arange(129)[:, np.newaxis, np.newaxis]
+    light = signal * np.diff(ndtr((edges - 2 * ranges / SPEED_OF_LIGHT) / SIGMA), axis=0) + 0.02
+    times = BIN * (np.arange(128) + 0.5)
+    counts = np.random.default_rng(seed).poisson(light)
+    return PhotonCube(counts, times, pulse=Pulse.gaussian(SIGMA * np.sqrt(8 * np.log(2))))
+
+
+def compute_z(found, truth):
+    ratio = (found.range - truth[found.y, found.x]) / found.confidence
+    return float(np.sqrt(np.mean(np.clip(ratio, -6, 6) ** 2)))
+
+
+@pytest.mark.parametrize(
+    ("signal", "speed_mm"), [(200.0, 0.0), (20.0, 1.0), (200.0, 1.0), (20.0, 10.0), (200.0, 10.0)]
+)
+def test_what_drifts_is_where_it_is_now(signal, speed_mm):
+    """Sums of 16 shots were late by 2 to 17 deviations. 16 clouds of 1000 pixels, which share what
+    they say of the speed: z scatters by 0.05.
+    """
+    pipeline, z, sigma = None, [], []
+    for number in range(24):
+        ranges = 2 + 0.01 * COLUMNS + 0.005 * ROWS + 1e-3 * speed_mm * number
+        shot = take_shot(ranges, signal, [number, 5])
+        pipeline = pipeline or make_pipeline(shot)
+        found = follow(pipeline, shot)
+        assert len(found.range) > 1000
+        z.append(compute_z(found, ranges))
+        sigma.append(np.median(found.confidence))
+    assert 0.85 < np.mean(z[8:]) < 1.2
+    assert speed_mm > 1 or np.mean(sigma[8:]) < 0.35 * sigma[0]
+
+
+@pytest.mark.parametrize(("step_ps", "width_ns"), [(100, 3), (640, 3), (1500, 5)])
+@pytest.mark.parametrize("photons", [20.0, 2000.0])
+def test_gates_in_coarse_steps_say_what_they_do_not_see(step_ps, width_ns, photons):
+    """At steps of 96 mm a millimetre was said of errors of 14; and light that every pixel sees long
+    was taken for background.
+    """
+    scan = {"gate_steps": int(20e3 // step_ps), "gate_step_ps": step_ps, "gate_width_ns": width_ns}
+    gate = GatedOptions(mode="gated", gate_offset_ps=3000.0, **scan)
+    delays = 6e-9 + 137e-12 * COLUMNS + 83e-12 * ROWS
+    late = (delays - gate.opening_times[:, np.newaxis, np.newaxis]) / 1e-10
+    light = photons * (ndtr(late) - ndtr(late - width_ns * 10)) + 0.004 * photons * width_ns
+    counts = np.random.default_rng(0).poisson(light)
+    pulse = _make_gate_response(gate.gate_record, gate.opening_times)
+    shot = PhotonCube(counts, gate.opening_times, pulse=pulse, sampled=True)
+    found = follow(make_pipeline(shot), shot)
+    assert len(found.range) > 1000
+    assert 0.7 < compute_z(found, delays * SPEED_OF_LIGHT / 2) < 1.3
