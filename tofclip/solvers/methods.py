@@ -50,24 +50,17 @@ MIN_FURTHER_FALL = 6e-3
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """When a block of frames is done.
+    """When a block of frames is done: after so many `iterations`, or as soon as one of these holds.
 
-    Parameters
-    ----------
-    iterations : int
-        Maximum number.
-    tolerance : float
-        Stop as soon as the block's objective changes by less than this fraction in an iteration in
-        which no frame's step was refused. 0 runs all iterations.
-    gap : float
-        Stop, too, as soon as every frame's duality gap is at most this fraction of its objective,
-        for solvers that know one. It is looked at every `GAP_INTERVAL` iterations.
-    further : int
-        Iterations that may follow, in steps of `GAP_INTERVAL`, as long as the last step took more
-        than `MIN_FURTHER_FALL` off the block's objective.
-    noise_fall : float
-        Stop, too, where more than `NOISE_FRACTION` of the objective at zero is left and an iteration
-        takes less than this fraction off: what it fits is noise. 0: never.
+    * the block's objective changes by less than the fraction `tolerance` in an iteration in which no
+      frame's step was refused; 0 runs all iterations;
+    * every frame's duality gap is at most the fraction `gap` of its objective, for solvers that know
+      one; it is looked at every `GAP_INTERVAL` iterations;
+    * more than `NOISE_FRACTION` of the objective at zero is left and an iteration takes less than the
+      fraction `noise_fall` off: what it fits is noise; 0: never.
+
+    So many `further` iterations may follow, in steps of `GAP_INTERVAL`, as long as the last step took more
+    than `MIN_FURTHER_FALL` off the block's objective.
     """
 
     iterations: int

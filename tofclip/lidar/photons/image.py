@@ -305,29 +305,13 @@ class PhotonImage:
 
 @dataclass(frozen=True)
 class PhotonCube:
-    """Histograms of a picture, as an instrument counted them.
-
-    Parameters
-    ----------
-    counts : (bins, rows, columns) array
-        Photons, not negative; of any number type.
-    times : (bins,) float64 array
-        Middle of each bin, s after the laser's pulse; evenly spaced.
-    camera : Camera, optional
-        Where the pixels look; `Camera.pinhole` where only that is known.
-    pulse : Pulse, optional
-        How a return at one instant shows in successive bins, where the instrument knows.
-    sampled : bool
-        Whether a bin shows one instant, as a picture behind a gate does, not all up to the next bin.
-    source : str
-        Where it came from, for messages.
-    provenance : mapping
-        How it came about.
-
-    Raises
-    ------
-    ShapeError, InputError
-        Not a cube, a time axis of another length, or one that is not even or not credible.
+    """Histograms of a picture, as an instrument counted them: `counts` (bins, rows, columns) of photons, not
+    negative, of any number type, at `times` (bins,), the middle of each bin, s after the laser's pulse,
+    evenly spaced. `camera` says where the pixels look (`Camera.pinhole` where only that is known), `pulse`
+    how a return at one instant shows in successive bins, where the instrument knows; `sampled` whether a
+    bin shows one instant, as a picture behind a gate does, not all up to the next bin; `source` where it
+    came from, for messages, and `provenance` how it came about. `ShapeError` or `InputError` for no cube,
+    a time axis of another length, or one that is not even or not credible.
     """
 
     counts: AnyArray
