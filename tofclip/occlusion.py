@@ -20,8 +20,8 @@ from tofclip.arrays import AnyArray, FloatArray, IntArray
 from tofclip.errors import require, require_positive, require_shape
 from tofclip.light_field.views import CameraSetup, ClipMeasurement
 from tofclip.operators import Diagonal, LinearOperator, LinearShear, Stack
+from tofclip.operators.base import View
 from tofclip.operators.cameras import LightFieldCamera
-from tofclip.operators.codes import View
 from tofclip.recovery.light_field import MAX_ITERATIONS, OBJECTIVE_TOLERANCE, ClipRecovery
 from tofclip.simulate.light_fields import CameraArray, TimeAxis
 from tofclip.solvers import TotalVariation

@@ -27,8 +27,8 @@ from tofclip.errors import (
     require_shape,
 )
 from tofclip.operators import LinearShear
+from tofclip.operators.base import View
 from tofclip.operators.cameras import CAMERAS, EvenAngleLineCamera, LightFieldCamera
-from tofclip.operators.codes import View
 from tofclip.operators.sparse import SparseMatrix
 from tofclip.storage import (
     Storable,

@@ -20,18 +20,16 @@ from tofclip.arrays import FloatArray, IndexArray
 from tofclip.errors import require, require_positive
 from tofclip.operators.base import (
     BlockDiagonal,
+    DenseSensor,
     Diagonal,
+    HadamardCodes,
     Identity,
     Integration,
     LinearOperator,
-    MeanWeighting,
-    Stack,
-)
-from tofclip.operators.codes import (
-    DenseSensor,
-    HadamardCodes,
     LinearShear,
+    MeanWeighting,
     PitchedSensor,
+    Stack,
     View,
     WeightedViews,
     make_sheared_mask,
@@ -480,7 +478,7 @@ class DiffuserCamera(PointSpreadCamera):
 class MeasuredCamera:
     """A camera known by its PSFs only, measured with a point source at several depths (supplement
     Note 4). `sensor`: from the light on the sensor's plane to the measurements, any of
-    `tofclip.operators.codes`; its plane may be smaller than the picture.
+    `tofclip.operators.base`; its plane may be smaller than the picture.
     """
 
     def __init__(

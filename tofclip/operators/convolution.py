@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from tofclip.arrays import AnyArray, Array, FloatArray
 from tofclip.errors import ShapeError, require
-from tofclip.operators.base import LinearOperator
-from tofclip.operators.codes import LinearShear, View
+from tofclip.operators.base import LinearOperator, LinearShear, View
 
 if TYPE_CHECKING:
     from scipy.interpolate import RectBivariateSpline

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from tofclip.arrays import AnyArray, Float32Array, FloatArray
 from tofclip.errors import ShapeError, require
 from tofclip.light_field import LightField
-from tofclip.operators.codes import View
+from tofclip.operators.base import View
 from tofclip.simulate.bodies import (
     NO_BODY,
     Body,
