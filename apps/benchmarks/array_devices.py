@@ -1,16 +1,17 @@
 """Study: the same work where arrays are put (``TOFCLIP_BENCH_DEVICE=cuda``; without it PyTorch on the
 CPU), against the compiled loops, and how far the results differ.
 
-Recovery and ranging are those of a LIFT shot: 7 views, 1016 instants. Around corners N x N wall
-points see four hidden points, and N^3 voxels are imaged; for back-projection half as many along
-every side. Inputs are on the device when the clock starts; each action ends when its result is
-there.
+Recovery is that of a LIFT shot, 7 views and 1016 instants, ranges are those of the demonstration's
+frames. Around corners N x N wall points see four hidden points, and N^3 voxels are imaged; for
+back-projection half as many along every side. Inputs are on the device when the clock starts; each
+action ends when its result is there.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,43 +20,25 @@ import numpy as np
 from apps.benchmarks.harness import Prepare, PreparedCase
 from apps.benchmarks.nlos import RELIEF_M, make_scene
 from apps.benchmarks.shots import (
-    ANGLES_RAD,
-    CENTRES_PX,
     ITERATIONS,
-    SLIT_WIDTH_PX,
     make_operator,
+    measurements,
+    prepare_method,
+    render_frames,
 )
 from nlos import Backprojection, Capture, Hybrid, PlanarRSD
 from nlos.method import Method as Imaging
-from tofclip.arrays import Array, ComputeDevice, Float32Array, namespace, parse_device, to_numpy
-from tofclip.camera import Camera
+from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy
 from tofclip.lidar import depth
-from tofclip.shots import Frames
 from tofclip.solvers import LinearInverse, Method, Sparse, TotalVariation
 
 DEVICE_VARIABLE = "TOFCLIP_BENCH_DEVICE"
 FRAMES = 1016
-BIN_S, FIRST_BIN_S = 20e-12, 10e-9
-NOISE, PEAK = 3.0, 100.0
-CARDS = 8  # a side
 
 
 def find_device() -> ComputeDevice:
     """The device that the environment names."""
     return parse_device(os.environ.get(DEVICE_VARIABLE) or "torch:cpu")
-
-
-def make_cards(side: int) -> Float32Array:
-    """Pictures (side, side, frames) of 8 x 8 cards at random ranges."""
-    random = np.random.default_rng(0)
-    delay = np.arange(FRAMES) - random.uniform(0, FRAMES, (CARDS, CARDS, 1))
-    cards = PEAK * np.exp(-4 * np.log(2) * (delay / 3) ** 2).astype(np.float32)
-    return np.repeat(np.repeat(cards, side // CARDS, axis=0), side // CARDS, axis=1)
-
-
-def add_noise(values: Float32Array) -> Float32Array:
-    """Values with readout noise."""
-    return values + NOISE * np.random.default_rng(1).standard_normal(values.shape, np.float32)
 
 
 def wait_for(result: Array) -> Array:
@@ -82,26 +65,21 @@ def compare_devices(
 
 
 def prepare_recovery(method: Method, side: int) -> PreparedCase:
-    """Frames from a shot's measurements; the linear inverse is prepared beforehand."""
-    operator = make_operator(side)
-    measurements = add_noise(operator(make_cards(side)))
-    recover: Callable[[Array], Any] = partial(method.recover, operator)
-    if isinstance(method, LinearInverse):
-        recover = method.prepare(operator).recover
-    moved = find_device().put(measurements)
-    return compare_devices(lambda given: recover(given).frames, measurements, moved, FRAMES)
+    """Frames from a shot's measurements."""
+    recover, data = prepare_method(method, make_operator(side)), measurements(FRAMES)
+    moved = find_device().put(data)
+    return compare_devices(lambda given: recover(given).frames, data, moved, FRAMES)
 
 
-def prepare_ranging(side: int) -> PreparedCase:
+def prepare_ranging(rows: int) -> PreparedCase:
     """Ranges of all returns in frames."""
-    camera = Camera(CENTRES_PX, ANGLES_RAD, (side, side), SLIT_WIDTH_PX, pulse_fwhm=3 * BIN_S)
-    values = add_noise(np.ascontiguousarray(np.moveaxis(make_cards(side), -1, 0)))
-    times = FIRST_BIN_S + BIN_S * np.arange(FRAMES, dtype=np.float64)
+    frames = render_frames(rows)
+    values, moved = frames.values, find_device().put(frames.values)
 
     def find_ranges(given: Array) -> Array:
-        return depth(Frames(given, times, camera)).range
+        return depth(replace(frames, values=given)).range
 
-    return compare_devices(find_ranges, values, find_device().put(values), side**2)
+    return compare_devices(find_ranges, values, moved, values[0].size)
 
 
 def prepare_imaging(

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from tofclip.lidar.photons import PhotonDetector, measure_accuracy
 from tofclip.operators import LineProjection
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
-from tofclip.shots import Streak
+from tofclip.shots import Frames, Streak
 from tofclip.simulate import (
     Instrument,
     make_default_instrument,
@@ -96,14 +97,19 @@ def run_dense_products(projection: LineProjection, data: Float32Array) -> None:
     run_blocks(project, data.shape[1])
 
 
+def prepare_method(method: Method, projection: LineProjection) -> Callable[[Any], Any]:
+    """What recovers measurements by a method; the linear inverse is prepared."""
+    if isinstance(method, LinearInverse):
+        return method.prepare(projection).recover
+    return partial(method.recover, projection)
+
+
 def prepare_recovery(
     method: Method, floor: Callable[[LineProjection, Float32Array], None], frames: int
 ) -> PreparedCase:
-    """A method beside the products that it needs; the linear inverse is prepared beforehand."""
+    """A method beside the products that it needs."""
     projection, data = make_operator(), measurements(frames)
-    recover: Callable[[Float32Array], object] = partial(method.recover, projection)
-    if isinstance(method, LinearInverse):
-        recover = method.prepare(projection).recover
+    recover = prepare_method(method, projection)
     return PreparedCase(lambda: recover(data), lambda: floor(projection, data), frames)
 
 
@@ -138,9 +144,14 @@ def make_instrument(rows: int) -> Instrument:
     return replace(made, detector=replace(made.detector, rows=rows))
 
 
+def render_frames(rows: int) -> Frames:
+    """The demo's scene without noise."""
+    return render_true_frames(make_default_scene(), make_instrument(rows), 1e4)
+
+
 def prepare_ranges(rows: int) -> PreparedCase:
     """Every return of every pixel; reading the frames once is the floor."""
-    frames = render_true_frames(make_default_scene(), make_instrument(rows), 1e4)
+    frames = render_frames(rows)
     target = np.empty_like(frames.values)
 
     def copy() -> None:
