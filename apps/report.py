@@ -71,7 +71,8 @@ def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | No
     `*suffixes`: endings that the name may have; none given: any; `inputs`: what must survive, see
     `tofclip.files.require_apart`.
     """
-    _require_file_name(out)
+    if not out.name or out.is_dir():
+        raise StorageError(f"{out}: cannot be written: it is a folder; name a file")
     if suffixes:
         require_suffix(out, *suffixes)
     if not out.parent.is_dir():
@@ -85,21 +86,18 @@ def require_writable(out: Path, *suffixes: str, inputs: Iterable[str | Path | No
         require_new(out)
 
 
-def _require_file_name(out: Path) -> None:
-    if not out.name or out.is_dir():
-        raise StorageError(f"{out}: cannot be written: it is a folder; name a file")
+def place_settings(out: Path, *suffixes: str, inputs: Sequence[str | Path | None]) -> Path:
+    """Return where the settings of a result go, and refuse either that cannot be written."""
+    require_writable(out, *suffixes, inputs=inputs)
+    settings = out.with_suffix(SETTINGS_SUFFIX)
+    require_writable(settings, inputs=inputs)
+    return settings
 
 
-def name_beside(out: Path, suffix: str) -> Path:
-    """Name what is written beside an output: as the output, with another ending."""
-    _require_file_name(out)
-    return out.with_suffix(suffix)
-
-
-def choose_preview(out: Path, preview: Path | None, inputs: Iterable[str | Path | None]) -> Path:
+def choose_preview(out: Path, preview: Path | None, inputs: Sequence[str | Path | None]) -> Path:
     """Return where the picture of a result goes, and refuse either that cannot be written."""
-    preview, inputs = preview or name_beside(out, ".png"), list(inputs)
     require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
+    preview = preview or out.with_suffix(".png")
     require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
     return preview
 

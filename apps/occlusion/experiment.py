@@ -466,16 +466,10 @@ def probe_target(
 def probe_with_fixed_camera(
     occluder: Bodies, region: InactiveRegion, factor: float, seeds: int
 ) -> list[ProbeResult]:
-    """Put a board behind an occluder, and look at its middle with a camera that knows neither.
-
-    One focal length, one focus and one pulse for all boards; the exposure is that of the brightest
-    measurement, of whatever body it is. Returns, gates and depths are found in the shot
-    (`TimedMeasurements.find_returns`). Such a camera gets too little light from a speck, so that
-    the board fills the picture; what is judged is a strip of it, as wide as the target of
-    `probe_target`, whose pattern has nothing to do with that beside it.
-
-    The occluder is upright, and so tall that no view sees its ends. Returns one result for each
-    seed, its pictures those of the strip; a correlation of 0 where no second return was found.
+    """Put a board behind an upright occluder, and look at its middle with a camera that knows neither,
+    once for each seed: one focal length, focus and pulse for all boards, the exposure of the brightest
+    measurement. Such a camera gets too little light from a speck, so that the board fills the picture;
+    what is judged is a strip of it, as wide as the target of `probe_target`.
     """
     distance = region.distance + factor * region.length
     width = TARGET_WIDTH_FRACTION * region.width

@@ -51,10 +51,8 @@ HELD_OUT_RUN = 4  # neighbouring measurements left out together by the cross-val
 def make_coded_line_sensors(
     image_shape: tuple[int, int], lines: int, width_px: int, steepest: float, seed: int
 ) -> list[SliceConvolution]:
-    """Build 1D sensors behind coded lines, each with a code of its own. `lines`: m; `width_px`:
-    n_p; `steepest`: angles run evenly from minus this to this, rad; 0 keeps all lines upright.
-    Returns one for each line, long enough for lines of 45 degrees from all of the picture, whatever
-    `steepest` is.
+    """Build 1D sensors behind m coded lines, each with a code of its own, whose angles run evenly from
+    minus `steepest` to this, rad; all are long enough for 45 degrees from all of the picture.
     """
     random = np.random.default_rng(seed)
     spreads = [
@@ -71,13 +69,9 @@ def recover_from_lines(
     sensors: Sequence[SliceConvolution],
     weight: float | None = None,
 ) -> tuple[AnyArray, float]:
-    """Measure each view of a light field by a coded line of its own, and recover the picture that
-    is in focus at one depth (supplement Eq. 21). `light_field`: as many views as there are sensors.
-    Each view's own picture is measured, so that surfaces out of focus enter the measurements as
-    they would in an instrument; `shear`: depth of the picture, pixels per view step; `sensors`: one
-    1D sensor for each view; `weight`: of total variation, relative to the largest value of A'f. By
-    default it is chosen by cross-validation: no true picture is looked at. Returns `picture` (rows,
-    columns); `weight`: the one that was used.
+    """Measure each view's own picture by a sensor of its own, as an instrument would, and recover the
+    picture that is in focus at one depth (supplement Eq. 21). `weight`: of total variation, relative to
+    the largest value of A'f, by default from cross-validation; the one that was used is returned too.
     """
     measured = [
         one(picture).ravel() for one, picture in zip(sensors, light_field.pictures, strict=True)
@@ -296,9 +290,7 @@ def measure_iteration_costs(
     repeats: int = 5,
 ) -> list[IterationCost]:
     """Time one iteration of every method of Table 1: FISTA with total variation for all of them
-    alike, in memory of about ten light fields in float32. `shear`, `sampling_ratio`: of CLIP;
-    `exposures`: r, of Ashok's and Babacan's methods; `repeats`: iterations timed, after a first one
-    that is not.
+    alike. `shear`, `sampling_ratio`: of CLIP; `exposures`: r, of Ashok's and Babacan's methods.
     """
     views = [(v, u) for v, u in light_field.views.tolist()]
     shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])

@@ -171,14 +171,8 @@ TEXTURE_THRESHOLD = 0.2  # of the steepest slopes
 def compute_depth_accuracy(
     found: AnyArray, true: AnyArray, picture: AnyArray, step: float
 ) -> float:
-    """Share of textured pixels whose shear is right to three quarters of the stack's step.
-
-    At an object's border the shear of either side counts, two pixels wide: what is in focus there
-    is both.
-
-    `found, true` (rows, columns): shears; `picture` (rows, columns): textured pixels have a slope
-    of a fifth of its steepest or more; six pixels at the border do not count; `step`: between the
-    shears of the focal stack. Returns 0 to 1.
+    """Share of a picture's textured pixels whose shear is right to three quarters of the stack's step;
+    at an object's border, where both are in focus, that of either side counts.
     """
     slope = np.hypot(*np.gradient(picture))
     textured = slope > TEXTURE_THRESHOLD * np.quantile(slope, 0.99)

@@ -39,8 +39,8 @@ from apps.report import (
     PRINTS_JSON,
     RECORD_SUFFIXES,
     REPLACES,
+    SETTINGS_SUFFIX,
     make_folder,
-    name_beside,
     report,
     require_writable,
     say,
@@ -127,8 +127,12 @@ class ResultFiles:
 
     volumes: Sequence[Path]  # the volume, in the format that each suffix names
     picture: Path | None
-    settings: Path  # written last: where it stands, the others are whole
     surface: Path | None = None  # the front surface with normals
+
+    @property
+    def settings(self) -> Path:
+        """Written last: where it stands, the others are whole."""
+        return self.volumes[0].with_suffix(SETTINGS_SUFFIX)
 
     @property
     def paths(self) -> list[Path]:
@@ -229,7 +233,7 @@ def reconstruct(
         return
     if cluster is not None:
         raise InputError(f"{source}: --cluster is for a folder of captures")
-    results = ResultFiles([out], png, name_beside(out, ".toml"), surface)
+    results = ResultFiles([out], png, surface)
     results.require_writable(source, settings)
     report(reconstruct_single(source, results, wanted, device), results.paths)
 
@@ -383,8 +387,7 @@ def _reconstruct_folder(
     sources, results = list_captures(inputs[0]), {}
     for path in sources:
         volumes = [out.resolve() / f"{path.stem}{suffix}" for suffix in suffixes]
-        picture = volumes[0].with_name(f"{path.stem}.png")
-        results[path] = ResultFiles(volumes, picture, picture.with_name(f"{path.stem}.toml"))
+        results[path] = ResultFiles(volumes, volumes[0].with_suffix(".png"))
     written = [path for one in results.values() for path in one.paths]
     require_apart([out, *written], [*inputs, *sources])
     make_folder(out)

@@ -28,7 +28,7 @@ from apps.progress import show_activity, show_progress
 from apps.report import (
     RECORD_SUFFIXES,
     make_folder,
-    name_beside,
+    place_settings,
     report,
     require_new,
     require_writable,
@@ -296,9 +296,7 @@ def compare(
     from nlos.io import read_capture
     from tofclip.notebook import save_figure
 
-    written = [out, name_beside(out, ".toml")]
-    require_writable(out, *PICTURE_SUFFIXES, inputs=(source, settings))
-    require_writable(written[1], inputs=(source, settings))
+    written = [out, place_settings(out, *PICTURE_SUFFIXES, inputs=(source, settings))]
     # Everything that can be refused is refused before the capture is read.
     names = tuple(METHODS.own) if wanted.methods is None else parse_method_names(wanted.methods)
     require_valid_settings(wanted, names)
@@ -355,9 +353,7 @@ def simulate(
     from nlos.known_scenes import simulate_scene
 
     inputs = [Path(path) for path in (settings, chosen.mesh) if path]
-    beside = name_beside(out, ".toml")
-    require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
-    require_writable(beside, inputs=inputs)
+    beside = place_settings(out, *RECORD_SUFFIXES, inputs=inputs)
     started = time.perf_counter()
     capture, truth = simulate_scene(chosen)
     capture = with_past(capture, {"verb": "nlos simulate", **settings_to_dict(chosen)}, *inputs)

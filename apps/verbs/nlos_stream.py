@@ -29,10 +29,9 @@ from apps.options import (
 from apps.progress import EXIT_SOME_FAILED, show_progress
 from apps.report import (
     make_folder,
-    name_beside,
+    place_settings,
     report,
     require_new,
-    require_writable,
     say,
     with_past,
 )
@@ -381,9 +380,7 @@ def film(
     from nlos.illumination import find_leg_bounds
     from nlos.io import read_capture
 
-    beside = name_beside(out, ".toml")
-    require_writable(out, *FILM_SUFFIXES, inputs=(source, settings))
-    require_writable(beside, inputs=(source, settings))
+    beside = place_settings(out, *FILM_SUFFIXES, inputs=(source, settings))
     _check_film(wanted, out)
     capture = read_capture(source)
     # Reading the file does not count as imaging.

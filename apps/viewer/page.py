@@ -233,24 +233,10 @@ AMBIENT_INTENSITY = 2.0  # light from everywhere, so that no side of a surface i
 Served = tuple["viser.ViserServer", str]  # a server and its address
 
 
-def serve_waiting(title: str, words: str, port: int | None = None, host: str = LOOPBACK) -> Served:
-    """Serve a page that says what is being done, until `Page` takes its place."""
-    server, address = start_server(port, host)
-    _set_up_panel(server, title)
-    say_waiting(server, words)
-    return server, address
-
-
-def say_waiting(server: viser.ViserServer, words: str) -> None:
-    """Say on a waiting page what is being done now."""
-    server.gui.reset()
-    server.gui.add_html(render_text_html("waiting", f"{words} ..."))
-
-
 class Page:
     """Serves a session. One thread, in `run`, owns the session; whatever the browsers ask for waits
-    in a queue. `host`: an IP address of this computer; `waiting`: what `serve_waiting` returned,
-    instead of port and host.
+    in a queue. `host`: an IP address of this computer; `waiting`: a server and its
+    address, instead of port and host.
     """
 
     def __init__(
@@ -399,19 +385,21 @@ class PageDoor:
     host: str  # an IP address of this computer, or ``"localhost"``
     port: int | None = None  # A free one by default
     no_browser: bool = False  # whether the page is not opened here
-    _waiting: Served | None = None
+    waiting: Served | None = None  # what says what is being done
 
     def open_waiting(self, title: str, words: str) -> None:
-        """Serve a page that says what is being done, if there is none yet."""
-        if self._waiting is None:
-            self._waiting = serve_waiting(title, words, self.port, parse_host(self.host))
-            self._show_address(self._waiting[1])
-        else:
-            say_waiting(self._waiting[0], words)
+        """Say what is being done now on a page, until `serve` takes its place."""
+        if self.waiting is None:
+            self.waiting = start_server(self.port, parse_host(self.host))
+            _set_up_panel(self.waiting[0], title)
+            self._show_address(self.waiting[1])
+        gui = self.waiting[0].gui
+        gui.reset()
+        gui.add_html(render_text_html("waiting", f"{words} ..."))
 
     def serve(self, session: Session) -> None:
-        page = Page(session, self.port, parse_host(self.host), self._waiting)
-        was_waiting, self._waiting = self._waiting is not None, None
+        page = Page(session, self.port, parse_host(self.host), self.waiting)
+        was_waiting, self.waiting = self.waiting is not None, None
         with contextlib.closing(page):
             if not was_waiting:
                 self._show_address(page.address)
@@ -419,8 +407,8 @@ class PageDoor:
 
     def close(self) -> None:
         """Stop serving a page that still waits: there will be nothing to look at."""
-        if self._waiting is not None:
-            stop_server(self._waiting[0])
+        if self.waiting is not None:
+            stop_server(self.waiting[0])
 
     def _show_address(self, address: str) -> None:
         report({"address": address})

@@ -80,7 +80,7 @@ class TestFolder:
     def test_a_result_belongs_to_the_capture_s_content_not_to_its_age(self, tmp_path):
         source, settings = tmp_path / "a.h5", tmp_path / "out.toml"
         source.write_bytes(b"one capture")
-        results = ResultFiles([tmp_path / "out.h5"], None, settings)
+        results = ResultFiles([tmp_path / "out.h5"], None)
         results.volumes[0].write_text("a result")
         save_settings(ReconstructSettings(), settings, f"a heading\n{note_content(source)}")
         assert load_settings(ReconstructSettings, settings, {}) == ReconstructSettings()

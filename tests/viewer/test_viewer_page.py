@@ -13,7 +13,7 @@ import viser
 from matplotlib.image import imread
 from viewer_scenes import PlaneSource, frames, volume
 
-from apps.viewer.page import Page, serve_waiting
+from apps.viewer.page import LOOPBACK, Page, PageDoor
 from apps.viewer.session import Session, read_state
 from apps.viewer.sources import (
     GATE_AROUND_FRAME,
@@ -446,13 +446,14 @@ def test_on_a_phone_the_panel_is_folded_and_the_scene_framed(browser, seen):
 
 def test_a_page_that_waits_becomes_the_page_in_the_same_tab_until_it_ends(browser):
     """A raw shot takes seconds: the browser has loaded by then, and says what it waits for."""
-    waiting = serve_waiting("shot.tif", "recovering <b>shot.tif")
+    door = PageDoor(LOOPBACK, no_browser=True)
+    door.open_waiting("shot.tif", "recovering <b>shot.tif")
     tab = browser.new_page(viewport=WINDOW)
-    tab.goto(waiting[1])
+    tab.goto(door.waiting[1])
     tab.locator("#waiting").wait_for(timeout=LOADING_MS)
     assert tab.locator("#waiting").inner_text() == "recovering <b>shot.tif ..."
     lost = tab.locator(".tofclip-lost")
-    with serve(PlaneSource(), waiting) as page:
+    with serve(PlaneSource(), door.waiting) as page:
         tab.locator("#frame-number").wait_for(timeout=LOADING_MS)
         assert tab.locator("#waiting").count() == 0
         (client,) = page.server.get_clients().values()
