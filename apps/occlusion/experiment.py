@@ -499,22 +499,25 @@ def probe_with_fixed_camera(
     for seed, rig in enumerate(rigs):
         clean = measure_views(pictures, rig, sweep)
         per_unit = PEAK_PHOTONS / float(clean.values.max())
-        dark = np.float32(FIXED_BACKGROUND_PHOTONS / per_unit)
-        noise = np.random.default_rng([seed, 4])
-        noisy = add_poisson_noise(clean.values + dark, per_unit, noise) - dark
+        noisy = _count_photons(clean.values, FIXED_BACKGROUND_PHOTONS, per_unit, [seed, 4])
         picture = separate_occluder(replace(clean, values=noisy)).target[:, strip]
         correlation = correlation_coefficient(picture, truth)
         results.append(ProbeResult(distance, factor, correlation, VIEW_COUNT, picture, truth))
     return results
 
 
+def _count_photons(
+    light: AnyArray, background: float, per_unit: float, seed: list[int]
+) -> AnyArray:
+    """Light as it is counted among background photons, which are taken off again."""
+    dark = np.float32(background / per_unit)
+    return add_poisson_noise(light + dark, per_unit, np.random.default_rng(seed)) - dark
+
+
 def _recover_target(rig: Rig, light: AnyArray, brightest: float, seed: int) -> tuple[AnyArray, int]:
     """Recover, blocked views left out; nothing where no view got significant light."""
     camera, per_unit = rig.camera, PEAK_PHOTONS / brightest
-    dark = BACKGROUND_PHOTONS / per_unit
-    measurements = add_poisson_noise(
-        light + dark, per_unit, np.random.default_rng([seed, 3])
-    ) - np.float32(dark)
+    measurements = _count_photons(light, BACKGROUND_PHOTONS, per_unit, [seed, 3])
     sizes = [encoder.shape_out[0] for encoder in camera.encoders]
     parts = np.split(measurements[:, 0], np.cumsum(sizes)[:-1])
     lights = np.array([part.mean() for part in parts])

@@ -132,7 +132,7 @@ def _format_tree(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
         elif isinstance(value, Mapping) and "shape" in value:
             shape = " x ".join(map(str, value["shape"])) or "single value"
             axes = f" ({', '.join(value['axes'])})" if value["axes"] else ""
-            values = f", {_format_values(value['values'])}" if "values" in value else ""
+            values = f", {_format_plain(value['values'])}" if "values" in value else ""
             yield f"{lead} {shape}{axes} {value['type']}{values} {value['units']}".rstrip()
         elif isinstance(value, Mapping):
             yield lead
@@ -150,9 +150,3 @@ def _format_plain(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     return "-" if value is None else str(value)
-
-
-def _format_values(values: Any) -> str:
-    if isinstance(values, list) and any(value is not None for value in values):
-        return f"[{', '.join(map(_format_values, values))}]"
-    return f"{values:.6g}" if isinstance(values, int | float) else "unknown"

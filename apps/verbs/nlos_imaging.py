@@ -204,13 +204,7 @@ class MeasuredVolume:
     seconds: float  # wall-clock time of the imaging, without compiling
     # most memory that the program took at a time beyond what it had before; None where the system
     # does not show
-    peak_bytes: int | None
-
-    @property
-    def costs(self) -> dict[str, float | None]:
-        """Time and memory by the names that reports use."""
-        peak = None if self.peak_bytes is None else self.peak_bytes / 2**20
-        return {"seconds": self.seconds, "peak_mib": peak}
+    peak_mib: float | None
 
 
 def measure_imaging(name: str, imaging: Method, capture: Capture, grid: Grid) -> MeasuredVolume:
@@ -225,7 +219,7 @@ def measure_imaging(name: str, imaging: Method, capture: Capture, grid: Grid) ->
     started = time.perf_counter()
     volume = image_capture(name, imaging.plan(capture, grid), capture)
     seconds = time.perf_counter() - started
-    taken = None if before is None else max(0, measure_peak_memory_bytes() - before)
+    taken = None if before is None else max(0, measure_peak_memory_bytes() - before) / 2**20
     return MeasuredVolume(volume, seconds, taken)
 
 
@@ -318,7 +312,8 @@ def compare(
         method = prepared.settings.make_method(name)
         runs[name] = run = measure_imaging(name, method, ours, grid)
         figures[name] = {
-            **run.costs,
+            "seconds": run.seconds,
+            "peak_mib": run.peak_mib,
             "correlation": known_scenes.correlate_views(
                 run.volume, next(iter(runs.values())).volume
             ),
@@ -421,7 +416,8 @@ def demo(
         "voxels": slow.volume.grid.shape,
         **{
             name: {
-                **image.costs,
+                "seconds": image.seconds,
+                "peak_mib": image.peak_mib,
                 "correlation": correlate_views(image.volume, slow.volume),
                 **compare_with_truth(image.volume, run.truth),
             }
