@@ -194,7 +194,8 @@ class TestStudies:
     def test_dealing_takes_recorded_scenes_only_where_there_are_any(self, library, monkeypatch):
         cases = [one for one in read_cases("dealing") if one.sampling_ratio == 1]
         monkeypatch.setattr(pictures, "read_cases", lambda _: cases)
-        outcome = pictures.run_angle_assignment(library, 1, lambda _: None)
+        (study,) = find_studies("dealing")
+        outcome = study.work(library, 1, lambda _: None)
         assert {row.labels[0] for row in outcome.rows} == {"letters", "blocks"}
 
     def test_dealing_evenly_halves_the_error_on_the_letters(self, shared_data):
