@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,13 +22,11 @@ from apps.viewer.sources import (
 from devices.transients import TrackedShots, TransientStream, read_transient
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError
-from tofclip.io import read_streak
-from tofclip.io.streaks import StreakStack
 from tofclip.lidar.photons import PhotonCube
 from tofclip.loading import CLOUD_SUFFIXES, load, outline
 from tofclip.plugins import METHODS
 from tofclip.recovery import open_shot, plan_recovery
-from tofclip.sequences import make_pipeline
+from tofclip.sequences import Shot, is_sequence, list_shots, make_pipeline
 from tofclip.shots import Streak
 from tofclip.solvers import LinearInverse, ProximalMethod
 
@@ -76,8 +73,8 @@ def open_source(
     name: str, options: ShotOptions | None = None, announce: Announce = lambda _: None
 ) -> Source:
     """Open a file, a folder of files, or the address of an instrument. `name`: whatever
-    `tofclip.load` opens and has points or light; another program's table of points; a stack of
-    shots; a folder of clouds or of shots; or an address such as ``sim+linospad2://?seed=1``;
+    `tofclip.load` opens and has points or light; another program's table of points; a folder of
+    clouds; a folder, pattern or stack of shots; or an address such as ``sim+linospad2://?seed=1``;
     `announce`: called with what is done where it takes seconds, as soon as the inputs are known to
     be good.
     """
@@ -85,24 +82,13 @@ def open_source(
     if "://" in name:
         return _open_instrument(name, options, announce)
     path = Path(name)
-    read = partial(read_streak, bin_width=options.bin_width)
     if path.is_dir():
         entries = sorted(entry for entry in path.iterdir() if entry.name[0] != ".")
         if clouds := [entry for entry in entries if entry.suffix.lower() in CLOUD_SUFFIXES]:
             return CloudSource(path.name, clouds)
-        shots = [partial(read, entry) for entry in entries if entry.is_file()]
-        if not shots:
-            raise InputError(f"{path}: the folder holds nothing to look at")
-        return _open_shots(path.name, shots, options, announce)
-    if StreakStack.is_one(path):
-        stack = StreakStack(path)
-
-        def read_stacked(number: int) -> Streak:
-            shot = stack.read_shot(number)
-            return shot if options.bin_width is None else shot.with_bin_width(options.bin_width)
-
-        shots = [partial(read_stacked, number) for number in range(len(stack))]
-        return _open_shots(path.name, shots, options, announce)
+    if is_sequence(path):
+        shots = list_shots(path, options.bin_width)
+        return _open_shots(path.name, list(shots.values()), options, announce)
     try:
         kind = outline(path).kind
     except FileFormatError:  # a table of another program may have fewer columns than ours
@@ -119,7 +105,7 @@ def open_source(
     if kind == "volume":
         return VolumeSource(path.name, load(path))
     if kind == "streak":
-        return _open_shots(path.name, [partial(read, path)], options, announce)
+        return _open_shots(path.name, [Shot(path, options.bin_width)], options, announce)
     if kind == "recording":
         return _open_instrument(f"file://{path}", options, announce)
     verb = {"capture": "nlos reconstruct", "light_field": "clip simulate"}.get(kind, "info")
