@@ -64,7 +64,11 @@ def folder(tmp_path_factory):
     shots = [streak(seed) for seed in range(3)]
     shots[0].save(place / "shot.h5")
     save_stack(shots, place / "stack.h5")
-    (place / "clouds").mkdir()
+    for name in ("clouds", "shots"):
+        (place / name).mkdir()
+    camera().save(place / "shots/camera.h5")  # no shot
+    for number, shot in enumerate(shots):
+        shot.save(place / f"shots/{number}.h5")
     for number in range(4):
         plane(50, 1 + number).save(place / "clouds" / f"cloud_{number:06d}.ply")
     return place
@@ -263,9 +267,10 @@ def test_a_single_shot_can_be_looked_at_by_its_surfaces(folder):
     np.testing.assert_allclose(np.sort(view.cloud.range), expected, rtol=1e-6)
 
 
-def test_a_stack_of_shots_is_recovered_shot_by_shot(folder):
+@pytest.mark.parametrize("shots", ["stack.h5", "shots"])
+def test_many_shots_are_recovered_shot_by_shot(folder, shots):
     options = ShotOptions(camera=folder / "camera.h5", time_zero=-20e-9)
-    source = open_source(str(folder / "stack.h5"), options)
+    source = open_source(str(folder / shots), options)
     assert len(source) == 3
     session = Session(source)
     shown = session.frame_at(0.0)
