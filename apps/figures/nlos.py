@@ -23,7 +23,7 @@ from apps.figures.style import (
     make_figure,
     outer_edges,
 )
-from apps.verbs.nlos_imaging import DemoRun
+from apps.verbs.nlos_imaging import WAVELENGTH_M, MeasuredVolume
 from nlos import Capture, Volume
 from nlos.known_scenes import HiddenTruth
 from tofclip.notebook import letter_panels
@@ -125,21 +125,25 @@ PANEL_ASPECT = 0.63  # of the panels that hold no image, relative to their width
 LIT_THRESHOLD = 0.02
 
 
-def make_demo_figure(run: DemoRun) -> Figure:
-    """Draw the room from above, one row's streak, and the images by all methods."""
+def make_demo_figure(
+    capture: Capture, truth: HiddenTruth, images: Mapping[str, MeasuredVolume]
+) -> Figure:
+    """Draw the room from above, one row's streak, and the images by all methods; ``flat`` is that for
+    a wall without its depth.
+    """
     figure = make_figure(11, 5.6)
     panels = figure.subplots(2, 3)
-    _draw_room(panels[0, 0], run)
-    _draw_streak(panels[0, 1], run.capture)
-    hybrid, slow, flat = (run.images[name] for name in ("hybrid", "backprojection", "flat"))
-    wavelength = f"{1e3 * run.wavelength:.0f} mm"
+    _draw_room(panels[0, 0], capture, truth)
+    _draw_streak(panels[0, 1], capture)
+    hybrid, slow, flat = (images[name] for name in ("hybrid", "backprojection", "flat"))
+    wavelength = f"{1e3 * WAVELENGTH_M:.0f} mm"
     for axes, image, plane, title in (
         (panels[0, 2], flat, "xy", "hybrid, had the wall been taken for flat"),
         (panels[1, 0], hybrid, "xy", f"hybrid, wavelength {wavelength}"),
         (panels[1, 1], slow, "xy", f"back-projection, wavelength {wavelength}"),
         (panels[1, 2], hybrid, "xz", "hybrid, seen from above"),
     ):
-        drawn = draw_view(axes, image.volume, plane, run.truth)
+        drawn = draw_view(axes, image.volume, plane, truth)
         down = "y, down (m)" if plane == "xy" else "z, away from the wall (m)"
         label_axes(axes, title, "x (m)", down)
         axes.plot([], [], color=LINE_COLOUR, label="truth")
@@ -151,16 +155,16 @@ def make_demo_figure(run: DemoRun) -> Figure:
     return figure
 
 
-def _draw_room(axes: Axes, run: DemoRun) -> None:
+def _draw_room(axes: Axes, capture: Capture, truth: HiddenTruth) -> None:
     """Top view with the wall at the upper edge: who sees what, and the way of light."""
-    middle = run.capture.wall[run.capture.wall.shape[0] // 2]
+    middle = capture.wall[capture.wall.shape[0] // 2]
     x, z = middle[:, 0], middle[:, 2]
     behind = z.min() - 0.14
     axes.fill_between(x, z, behind, color=WALL_COLOUR)
     axes.plot(x, z, color=INK_COLOUR, lw=2)
-    draw_outline(axes, run.truth, "xz")
+    draw_outline(axes, truth, "xz")
     seen = np.argmin(np.abs(x - WALL_POINT_X_M))
-    laser_x, _, laser_z = run.capture.laser.tolist()
+    laser_x, _, laser_z = capture.laser.tolist()
     spot, point = (laser_x, laser_z), (x[seen], z[seen])
     for start, end, colour, style in (
         (DEVICE_POSITION_M, spot, DEVICE_COLOUR, "--"),

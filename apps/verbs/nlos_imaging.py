@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -366,17 +366,6 @@ def simulate(
     report(figures, [out, beside])
 
 
-@dataclass(frozen=True)
-class DemoRun:
-    """Everything that a demonstration made."""
-
-    capture: Capture
-    truth: HiddenTruth
-    # by method; ``flat`` is the hybrid method for a wall without its depth
-    images: Mapping[str, MeasuredVolume]
-    wavelength: float  # of all methods, m
-
-
 def demo(
     out: Path = opt("DIR", "Folder for the results; made if missing.", Path("nlos-demo-output")),
     png: Path | None = opt(
@@ -394,6 +383,7 @@ def demo(
     Example: tofclip nlos demo --out nlos-demo-output
     """
     from apps.figures.nlos import make_demo_figure
+    from nlos import Backprojection, Grid, Hybrid
     from nlos.known_scenes import compare_with_truth, correlate_views
     from tofclip.notebook import save_figure
 
@@ -404,51 +394,41 @@ def demo(
     require_writable(picture, *PICTURE_SUFFIXES)
     written = [out / f"{name}.h5" for name in ("capture", "hybrid", "backprojection")]
     require_new(*written)
-    run = run_demo(seed)
-    run.truth.attach_to_record(run.capture).save(written[0])
-    for path in written[1:]:
-        run.images[path.stem].volume.save(path)
-    save_figure(make_demo_figure(run), picture)
-    slow = run.images["backprojection"]
-    figures = {
-        "seed": seed,
-        "wall_points": len(run.capture.points),
-        "voxels": slow.volume.grid.shape,
-        **{
-            name: {
-                "seconds": image.seconds,
-                "peak_mib": image.peak_mib,
-                "correlation": correlate_views(image.volume, slow.volume),
-                **compare_with_truth(image.volume, run.truth),
-            }
-            for name, image in run.images.items()
-        },
-        "times_faster": slow.seconds / run.images["hybrid"].seconds,
-        "seconds": time.perf_counter() - started,
-    }
-    report(figures, [*written, picture])
-
-
-def run_demo(seed: int) -> DemoRun:
-    """The whole way, from a scene to three images."""
-    from nlos import Backprojection, Grid, Hybrid
-
     with show_activity("simulating"):
         capture, truth = _simulate_letters(seed)
     capture = with_past(capture, {"verb": "nlos demo", "seed": seed})
-    grid, hybrid = Grid.box(*BOX_M, VOXEL_M), Hybrid(WAVELENGTH_M)
     # The same signals with the curve ignored show what knowing the wall is worth.
     wall, laser = capture.wall.copy(), capture.laser.copy()
     wall[..., 2] = laser[..., 2] = 0.0
     flat = replace(capture, wall=wall, laser=laser)
+    grid, hybrid = Grid.box(*BOX_M, VOXEL_M), Hybrid(WAVELENGTH_M)
+    slow = Backprojection(WAVELENGTH_M)
     images = {
         "hybrid": measure_imaging("hybrid", hybrid, capture, grid),
-        "backprojection": measure_imaging(
-            "backprojection", Backprojection(WAVELENGTH_M), capture, grid
-        ),
+        "backprojection": measure_imaging("backprojection", slow, capture, grid),
         "flat": measure_imaging("as if flat", hybrid, flat, grid),
     }
-    return DemoRun(capture, truth, images, WAVELENGTH_M)
+    truth.attach_to_record(capture).save(written[0])
+    for path in written[1:]:
+        images[path.stem].volume.save(path)
+    save_figure(make_demo_figure(capture, truth, images), picture)
+    figures = {
+        "seed": seed,
+        "wall_points": len(capture.points),
+        "voxels": grid.shape,
+        **{
+            name: {
+                "seconds": image.seconds,
+                "peak_mib": image.peak_mib,
+                "correlation": correlate_views(image.volume, images["backprojection"].volume),
+                **compare_with_truth(image.volume, truth),
+            }
+            for name, image in images.items()
+        },
+        "times_faster": images["backprojection"].seconds / images["hybrid"].seconds,
+        "seconds": time.perf_counter() - started,
+    }
+    report(figures, [*written, picture])
 
 
 def _simulate_letters(seed: int) -> tuple[Capture, HiddenTruth]:
