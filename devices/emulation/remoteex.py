@@ -39,14 +39,6 @@ from tofclip.errors import InputError, ProtocolError
 from tofclip.storage import Record
 
 SUPPORTED_FAULTS = ("timeout", "short", "unplug", "corrupt", "lost", "overflow")
-SINGLE_SWEEPS = ("1 ns", "20 ns", "100 ns", "1 us", "10 \u00b5s")
-SYNCHROSCAN_SWEEPS = ("1", "2", "3", "4", "5")
-FIXED_ANSWERS: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(("append", "acqacqmonitor", "seqstart", "imgsave", "imgload"), ()),
-    "appinfo": ("9.5 pf4",),
-    "applicenceget": ("1", "1", "1"),
-    "imgindexget": ("0",),
-}
 
 
 @dataclass
@@ -96,18 +88,7 @@ class EmulatedStreakCamera:
             )
         self._light, self._interval, self._frames = light, 1 / frame_rate, frames
         self._faults = index_faults(faults, SUPPORTED_FAULTS)
-        self._tube = {
-            "Time Range": self.time_range,
-            "Mode": "Operate",
-            GAIN_PARAMETER: "0",
-            "Shutter": "Closed",
-            "Gate Mode": "Normal",
-            "Trig. Mode": "Cont",
-            "Trig. level": "1",
-            "Trig. slope": "Rising",
-            "DeviceName": "C0000",
-        }
-        self._sensor = {"Exposure": "30 ms", "Binning": "1 x 1"}
+        self._tube = {"Time Range": self.time_range, "Mode": "Operate", GAIN_PARAMETER: "0"}
         self._run = _Acquisition()
         self._requests = 0
         self.taken = 0
@@ -174,36 +155,21 @@ class EmulatedStreakCamera:
     def _execute(  # noqa: C901 - a table
         self, command: Command, connection: Connection
     ) -> tuple[str, ...] | None:
-        """Do what the handbook says; return what is answered, None where that has been sent."""
-        tube, sensor, run = self._tube, self._sensor, self._run
+        """Do what the handbook says of what drivers ask; return what is answered, None where that has
+        been sent.
+        """
+        tube, run = self._tube, self._run
         match (command.name.casefold(), *command.arguments):
-            case (name, *_) if not self.is_application_up and name not in ("appstart", "appinfo"):
+            case (name, *_) if not self.is_application_up and name != "appstart":
                 raise _RefusedError(AnswerCode.NOT_NOW, "application not running")
             case ("appstart", *_):
                 self.is_application_up = True
                 return ()
-            case (name, *_) if name in FIXED_ANSWERS:
-                return FIXED_ANSWERS[name]
             case ("devparamget", place, name) if place == STREAK_TUBE and name in tube:
                 return (tube[name],)
             case ("devparamset", _, name, value) if name in tube:
                 tube[name] = value
                 return ()
-            case ("devparaminfoex", _, name) if name == GAIN_PARAMETER:
-                # label, current value, type, readable and writable, range
-                return (name, self.gain, "1", "1", "1", "0", "63")
-            case ("devparaminfoex", _, name) if name in tube:
-                ranges = SYNCHROSCAN_SWEEPS if self.time_range.isdecimal() else SINGLE_SWEEPS
-                return (name, tube[name], "2", "1", "1", "5", *ranges)
-            case ("devparamslist", *_):
-                return (str(len(tube)), *tube)
-            case ("camparamget", *_, name) if name in sensor:
-                return (sensor[name],)
-            case ("camparamset", _, name, value) if name in sensor:
-                sensor[name] = value
-                return ()
-            case ("camparaminfoex", *_, name) if name in sensor:
-                return (name, sensor[name], "2", "1", "1", "1", sensor[name])
             case ("acqlivemonitor", "RingBuffer", number) if number.isdecimal():
                 buffers = max(1, int(number))
                 if run.is_running and run.is_operators:

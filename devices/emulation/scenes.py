@@ -113,9 +113,7 @@ def simulate_light(scene: str) -> LineLight:
         # Rays at half of its density: nobody has to wait for an instrument that is not there.
         instrument = replace(make_default_instrument(), rays_per_pixel_side=2)
         seen = make_default_scene()
-    shot = simulate_shot(
-        seen, instrument, seed=0
-    )  # the expected signal: no noise for a seed to draw
+    shot = simulate_shot(seen, instrument, seed=0)  # of which no noise is taken
     photons = shot.signal.astype(np.float64) + instrument.detector.background_photons
     photons.flags.writeable = False  # it is shared by all who look at this scene
     camera = shot.camera

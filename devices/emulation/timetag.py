@@ -83,9 +83,8 @@ SCENE_SCALE = 64
 """The scene is this many times as large as a table-top one, and its light takes as many times as long: the counter's
 ticks are 1.2 m of range."""
 
-BLOCK_TICKS = (
-    PERIOD_TICKS * PULSES_PER_BLOCK
-)  # a divisor of the counter's range: it wraps where a block begins
+# a divisor of the counter's range: it wraps where a block begins
+BLOCK_TICKS = PERIOD_TICKS * PULSES_PER_BLOCK
 
 
 class PulsedSceneStream:
