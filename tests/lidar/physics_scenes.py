@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from tofclip.camera import Camera, SkewSweep
@@ -390,11 +391,13 @@ def make_shot(
     haze=0.0,
     bend=0.0,
     row_s=ROW_S,
+    blur=0.0,
 ):
     """Simulate a shot whose brightest streak pixel expects `photons`. `scene`: one of `SCENES`, or
     surfaces; `background`: photons a pixel; `afterglow`: fraction of the light that comes late, by 400 ps
     in the mean; `haze`: fraction that is scattered along the slit, 10 columns far in the mean; `bend`:
-    rows by which the outer views come later than a straight delay has them; `row_s`: duration of a row.
+    rows by which the outer views come later than a straight delay has them; `row_s`: duration of a row;
+    `blur`: standard deviation of what a streak tube spreads along the slit, px.
     """
     random = np.random.default_rng([seed, 0])
     if isinstance(scene, str):
@@ -443,6 +446,8 @@ def make_shot(
         away = np.exp(-np.abs(np.arange(-60, 61)) / 10)
         hazy = [np.convolve(row, away / away.sum(), "same") for row in gathered]
         gathered = (1 - haze) * gathered + haze * np.array(hazy)
+    if blur:
+        gathered = gaussian_filter1d(gathered, blur, axis=1, mode="constant")
     length = rows * FINE + late.size
     spectrum = np.fft.rfft(gathered, length, axis=0) * np.fft.rfft(shape, length)[:, None]
     spread = np.fft.irfft(spectrum, length, axis=0)[24 * FINE :][: rows * FINE]

@@ -106,6 +106,7 @@ class SurfaceModel(SurfacePoints):
     ) -> None:
         self.dark = estimate_dark_variance(streak)
         self.image, self.weights = weigh_measurements(streak, camera, self.dark)
+        self.blur_px = 0.0
         super().__init__(streak, camera, masks, bases, state, pulse)
 
     def place(self, state: SurfaceState) -> None:
@@ -158,6 +159,18 @@ class SurfaceModel(SurfacePoints):
         other.place(self.state)
         return other
 
+    def blur(self, sigma_px: float) -> Self:
+        """Return the same surfaces as an instrument shows them that blurs along the slit."""
+        other = copy.copy(self)
+        other.blur_px = sigma_px
+        return other
+
+    def _blur(self, images: Image) -> Image:
+        """Its own adjoint."""
+        if not self.blur_px:
+            return images
+        return scipy.ndimage.gaussian_filter1d(images, self.blur_px, mode="constant")
+
     def unexplained(self, amplitude: Image) -> float:
         """What is left of the signal, as a fraction."""
         return compare_smoothed(self.render(amplitude), self.image, self.weights > 0)
@@ -172,9 +185,10 @@ class SurfaceModel(SurfacePoints):
         rows, columns = box = self._find_box(view, part)
         first, last = (int(rows[0]), int(rows[-1]) + 1) if rows.size else (0, 0)
         top, bottom = place.first_row + first, place.first_row + last
+        reach = int(np.ceil(4 * self.blur_px))
         left, right = (
             min(max(place.first_column + one, 0), self.shape[1])
-            for one in (columns.start, columns.stop)
+            for one in (columns.start - reach, columns.stop + reach)
         )
         light = np.zeros((len(lights), bottom - top, right - left), np.float32)
         self._project(view, lights, kernel, part, box, (top, left), light)
@@ -230,11 +244,11 @@ class SurfaceModel(SurfacePoints):
 
         rows = max(rows, 0)
         if not self.pulse.reach:
-            return light[:, first : first + rows]
+            return self._blur(light[:, first : first + rows])
         images = np.zeros((len(light), rows, light.shape[2]), np.float32)
         shares = self.pulse.shares.astype(np.float32)
         smooth_rows(light, shares, self.pulse.lags, np.arange(rows), first, 0, images)
-        return images
+        return self._blur(images)
 
     def render(self, amplitude: Image) -> Image:
         """Return A a, (rows, columns)."""
@@ -288,7 +302,7 @@ class SurfaceModel(SurfacePoints):
 
     def _gather_lit(self, image: Image, squared: bool = False) -> Image:
         """A' of the rows of an image that light reaches."""
-        seen = image if squared else self._spread_back(image)
+        seen = self._blur(image) if squared else self._spread_back(image)
         shares = self.share_out(partial(self._gather, seen, squared=squared), self.camera.views)
         return reduce(np.add, shares)
 
@@ -296,6 +310,7 @@ class SurfaceModel(SurfacePoints):
         """The adjoint of `_trail`, from the rows of an image that light reaches."""
         from tofclip.recovery.surfaces.kernels import smooth_rows
 
+        image = self._blur(image)
         if not self.pulse.reach:
             return image
         rows = self._lit_before
@@ -324,7 +339,10 @@ class SurfaceModel(SurfacePoints):
                 kernel = self.pulse.extend(self.make_kernel(view, variance=0.0)) ** 2
                 slit_shares = slit_shares**2
                 lags = np.arange(kernel.size) - kernel.size // 2
-                shares = shares**2 * self.places.overlap
+                # of a square pixel on those of the slit
+                slit_px = np.sqrt((2 + np.tan(self.camera.angles[view]) ** 2) / 12)
+                blurred = np.float32(slit_px / np.hypot(slit_px, self.blur_px))
+                shares = shares**2 * self.places.overlap * blurred
             light = np.zeros((1, *place.shape), np.float32)
             below = place.first_row - above
             lines = -lags, place.reached_rows, below, place.first_column
