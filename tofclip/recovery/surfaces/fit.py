@@ -24,6 +24,7 @@ from tofclip.recovery.surfaces.patches import find_dimmer_patches, rank_within_p
 from tofclip.recovery.surfaces.pulse import (
     LEAST_EXPLAINED,
     LEAST_TAIL,
+    TINY,
     Image,
     measure_pulse,
 )
@@ -454,13 +455,16 @@ def _measure_step(
     solver: AmplitudeSolver, before: FloatArray, found: Refinement
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """How far ranges went of each surface, the sum of squares over its lit points in their deviations, and
-    how many these are, (surfaces,) each; `before`: ranges, (points,).
+    how many these are, (surfaces,) each, the more a point counts the more light it has; `before`: ranges,
+    (points,).
     """
-    model, lit = solver.model, solver.amplitude > 0
+    model, light = solver.model, solver.amplitude
     moved = (model.distance - before) / model.estimate_deviation(found.covariances)
-    squares = np.where(lit, moved, 0) ** 2
-    far, points = (np.bincount(model.surface, one, len(model.parts)) for one in (squares, lit))
-    return far, points
+    far, whole, points = (
+        np.bincount(model.surface, one, len(model.parts))
+        for one in (light * moved**2, light, light > 0)
+    )
+    return points * far / np.maximum(whole, TINY), points
 
 
 def settle_surfaces(solver: AmplitudeSolver, chosen: NDArray[np.bool_], found: Refinement) -> None:

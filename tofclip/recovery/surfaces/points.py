@@ -296,28 +296,31 @@ class SurfacePoints:
         all that is left of it is on average.
         """
         places, size = self.places, self.distance.size
-        # of each point, how much of its light turning away leaves, and whether its surface ends in it
+        # of each point, how much of its light turning away leaves, and whether its surface ends in it or before
         self.facing, self.at_limb = np.ones(size), np.zeros(size, bool)
         curved = {k: one for k, one in enumerate(self.bases) if isinstance(one, QuadricBasis)}
         if not curved:
             return
-        distance, light = places.distance.copy(), np.ones(places.point.size)
+        distance = places.distance.copy()
+        within, area, light = np.ones((3, places.point.size))
         for surface, basis in curved.items():
             part, coefficients = self.parts[surface], self.state.coefficients[surface]
             own = slice(int(places.starts[part.start]), int(places.starts[part.stop]))
             point, offset = places.point[own], places.offset[:, own]
-            inverse, slope, inside = basis.look_between(self.pixel[point], offset, coefficients)
+            seen = self.pixel[point], offset, places.size[:, own], coefficients
+            inverse, slope, within[own] = basis.look_between(*seen)
             inverse = np.maximum(inverse, MIN_INVERSE_DEPTH)
-            there = np.bincount(point - part.start, inside)[point - part.start] > 0
+            there = np.bincount(point - part.start, within[own])[point - part.start] > 0
             _, _, ways = self._aim_at(point, offset)
             distance[own] = np.where(there, 1 / ways[:, 2] / inverse, distance[own])
             facing = 1 / np.hypot(1, self.camera.focal_length_px * slope / inverse)
-            light[own] = np.where(there, facing * inside, 1)
+            area[own] = np.where(there, within[own], 1)
+            light[own] = np.where(there, facing * within[own], 1)
         self.places = places.choose(distance, light)
-        before, left = np.diff(places.starts), np.diff(self.places.starts)
-        self.facing, self.at_limb = np.bincount(places.point, light) / before, left < before
-        mean = np.bincount(self.places.point, self.places.distance) / left
-        self.distance = np.where(np.isin(self.surface, list(curved)), mean, self.distance)
+        parts, found = np.diff(places.starts), (within, light, area, area * distance)
+        inside, lights, areas, total = (np.bincount(places.point, one) for one in found)
+        self.facing, self.at_limb = lights / parts, inside < parts
+        self.distance = np.where(np.isin(self.surface, list(curved)), total / areas, self.distance)
 
     def fill_partly(self, amplitude: Image) -> None:
         """Put the light of pixels that a surface fills in part on the side of the brighter of the pixels
@@ -337,7 +340,8 @@ class SurfacePoints:
             (1 - np.maximum(part, LEAST_FILLED)) / 2 * (light - dark) / np.maximum(amplitude, TINY)
         )
         self.aside = np.where(behind > before, away, -away).astype(np.float64)
-        self.aside[:, self.at_limb] = 0
+        # towards a limb light ends where the surface does
+        self.aside[:, self.at_limb | self.at_limb[self.beside].any(axis=(0, 1))] = 0
         self.place(self.state)
 
     def find_light_beside(self, amplitude: Image) -> Image:

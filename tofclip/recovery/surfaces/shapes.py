@@ -188,25 +188,29 @@ class QuadricBasis(SmoothBasis):
         return np.asarray(found.x)
 
     def look_between(
-        self, pixels: Pixels, offset: FloatArray, coefficients: FloatArray
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Return inverse depths beside the middles of pixels, (n,), by `offset`, (2, n), px to the right and
-        down, with nothing rounded off; by how much they change from pixel to pixel; and which are within
-        the limb.
+        self, pixels: Pixels, offset: FloatArray, size: FloatArray, coefficients: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return inverse depths of parts of pixels, (n,), `offset` from the pixels' middles and of a `size`, (2, n),
+        px to the right and down, with nothing rounded off; by how much they change from pixel to pixel; and how
+        much of each part is within the limb. All of it changes evenly as the limb moves.
         """
         row, column = np.divmod(pixels, self.image_shape[1])
         functions = self._stack(row + offset[1], column + offset[0])
         q, slopes = self._differentiate_square(functions, coefficients)
-        inside, linear = q > 0, coefficients[:LINEAR]
-        root = np.sqrt(np.where(inside, q, 1.0))
+        linear, tiny = coefficients[:LINEAR], np.finfo(np.float64).tiny
+        across, down = (one * slope for one, (slope, _) in zip(size, slopes, strict=True))
+        change = np.hypot(across, down) + tiny
+        filled = np.clip(q / change + 0.5, 0, 1)
+        # of a part that the limb crosses, the middle of what is within
+        root = np.sqrt(np.where(filled < 1, filled * change / 2 + tiny, q))
         steepness = [
             2 / side * along + self.sign * slope / (2 * root)
             for along, side, (slope, _) in zip(
                 linear[1:], self._measure_box()[::-1], slopes, strict=True
             )
         ]
-        inverse = functions[:, :LINEAR] @ linear + self.sign * np.where(inside, root, 0)
-        return inverse, np.hypot(*steepness), inside
+        inverse = functions[:, :LINEAR] @ linear + self.sign * root
+        return inverse, np.hypot(*steepness), filled
 
     def _differentiate_square(
         self, functions: FloatArray, coefficients: FloatArray
