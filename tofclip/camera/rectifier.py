@@ -17,7 +17,7 @@ from tofclip.units import MAD_TO_SIGMA
 DARK_ROW_FRACTION = 0.05
 # Deviations within which readings of the dark lie, of whole counts half of one at least: what is brighter
 # is light that comes in quiet rows as well
-DARK_SIGMAS, LEAST_SPREAD_COUNT = 3.5, 0.5
+DARK_SIGMAS, LEAST_SPREAD_COUNT = 5.0, 0.5
 ROWS_PER_BLOCK = 64
 NO_LIGHT_MESSAGE = "nothing rises above the dark level; was there any light?"
 

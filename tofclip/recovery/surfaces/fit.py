@@ -20,7 +20,12 @@ from tofclip.lidar import Detection, depth
 from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, Tick, share_misfit
 from tofclip.recovery.surfaces.model import SurfaceModel
-from tofclip.recovery.surfaces.patches import find_dimmer_patches, rank_within_pixels
+from tofclip.recovery.surfaces.patches import (
+    MIN_ROUND_PX,
+    find_dimmer_patches,
+    rank_within_pixels,
+)
+from tofclip.recovery.surfaces.points import Shape
 from tofclip.recovery.surfaces.pulse import (
     LEAST_EXPLAINED,
     LEAST_TAIL,
@@ -29,7 +34,7 @@ from tofclip.recovery.surfaces.pulse import (
     measure_pulse,
 )
 from tofclip.recovery.surfaces.ranges import Refinement, refine_state
-from tofclip.recovery.surfaces.shapes import COEFFICIENTS, ROUND_COEFFICIENTS, Pixels
+from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, Pixels, QuadricBasis
 from tofclip.recovery.surfaces.start import (
     CHANGED_RATIO,
     MAX_UNEXPLAINED,
@@ -65,6 +70,10 @@ CHANGED_EXCESS = 0.02  # beyond `CHANGED_RATIO` of what surfaces left unexplaine
 # Of the greatest need to be bent of all surfaces, or of a need that leaves no doubt: those that need it
 # more are bent.
 CERTAINLY_BENT, NO_DOUBT = 3.0, 100.0
+
+ROUND_FRACTION = (
+    0.3  # of a surface's usual brightness: the shape of what is dimmer says nothing of it
+)
 
 DOUBLE_FRACTION = 0.2  # of a surface's lit points: that many beside another's may be the other's
 
@@ -370,7 +379,7 @@ def _join(solver: AmplitudeSolver, large: int, small: int, like: list[int]) -> A
     masks[small] = False
     joined = solver.cover(masks)
     joined.amplitude = pictures[masks]
-    joined.model = joined.model.straighten({large - (small < large): nearest})
+    joined.model = joined.model.reshape({large - (small < large): nearest})
     return joined
 
 
@@ -384,42 +393,64 @@ def _measure_misfit(solver: AmplitudeSolver) -> float:
 def straighten_surfaces(
     solver: AmplitudeSolver,
 ) -> tuple[AmplitudeSolver, Refinement | None]:
-    """Replace splines and quadrics by quadratics where these explain the shot as well, after a step;
-    return what that step knew as well, if there was one. Splines follow the returns of frames, also where these
-    are displaced, as behind gauze; the shot itself says whether the surface is bent.
+    """Replace splines by surfaces of second order, and both by quadratics, where these explain the shot as
+    well, after a step; return what that step knew as well, if there was one. Splines follow the returns of
+    frames, also where these are displaced, as behind gauze; the shot itself says whether the surface is bent.
     """
     model = solver.model
-    bent = [
-        surface
-        for surface, basis in enumerate(model.bases)
-        if not basis.is_quadratic and (solver.amplitude[model.parts[surface]] > 0).any()
-    ]
+    lit = np.bincount(model.surface, solver.amplitude > 0, len(model.bases))
+    bent = [k for k, basis in enumerate(model.bases) if not basis.is_quadratic and lit[k]]
     if not bent:
         return solver, None
     ahead = copy.copy(model)
-    before, straight = refine_state(ahead, solver.amplitude), bent
-    light = model.render(solver.amplitude)
+    before = refine_state(ahead, solver.amplitude)
+    usual = [
+        np.median(one[one > 0]) if one.any() else 0
+        for one in map(solver.amplitude.__getitem__, model.parts)
+    ]
+    bright = solver.amplitude > ROUND_FRACTION * np.array(usual)[model.surface]
+    points = {k: np.flatnonzero((model.surface == k) & bright) for k in bent}
+    splines = [k for k in bent if not isinstance(model.bases[k], QuadricBasis)]
+    round_ = {k: ahead.find_quadric(points[k]) for k in splines if points[k].size >= MIN_ROUND_PX}
+    if round_:
+        _, _, needed = _try_shapes(solver, ahead, before, round_)
+        round_ = {k: shape for k, shape in round_.items() if needed[k] <= 0}
+    if round_:
+        solver.model = model.reshape(round_)
+        return straighten_surfaces(solver)
+    straight = bent
     while straight:
-        own = ((one, np.flatnonzero(model.surface == one)) for one in straight)
-        trial = model.straighten(
-            {one: model.find_quadratic(points, solver.amplitude) for one, points in own}
-        )
-        # what amplitudes explain hardly depends on the basis: begun there, but still a first step
-        after = refine_state(trial, solver.amplitude, replace(before, steps=0))
-        change = model.weights * (after.rest**2 - before.rest**2)
-        excess = share_misfit(model, solver.amplitude, light, change)
-        needed = []
-        for surface in straight:
-            basis, coefficients = ahead.bases[surface], ahead.state.coefficients[surface]
-            freedom = 2 * solver.variance * (coefficients.size - COEFFICIENTS)
-            bending = coefficients @ basis.bending @ coefficients
-            needed.append(excess[model.parts[surface]].sum() / (freedom + bending))
-        if max(needed) <= 1:
+        own = {k: np.flatnonzero(model.surface == k) for k in straight}
+        plain = {k: model.find_quadratic(points, solver.amplitude) for k, points in own.items()}
+        trial, after, needed = _try_shapes(solver, ahead, before, plain)
+        most = max(needed.values())
+        if most <= 1:
             return AmplitudeSolver(trial, after.amplitude, solver.weight, solver), after
         # one that is bent for certain takes light from others: these are tried again without it
-        least = max(1.0, min(max(needed), NO_DOUBT) / CERTAINLY_BENT)
-        straight = [one for one, need in zip(straight, needed, strict=True) if need <= least]
+        least = max(1.0, min(most, NO_DOUBT) / CERTAINLY_BENT)
+        straight = [k for k in straight if needed[k] <= least]
     return AmplitudeSolver(ahead, before.amplitude, solver.weight, solver), before
+
+
+def _try_shapes(
+    solver: AmplitudeSolver, ahead: SurfaceModel, before: Refinement, shapes: dict[int, Shape]
+) -> tuple[SurfaceModel, Refinement, dict[int, float]]:
+    """Take the step that led `ahead` with other shapes of some surfaces; also return how much worse each explains the
+    shot, of what the freedom that it lacks is worth.
+    """
+    model = solver.model
+    trial = model.reshape(shapes)
+    # what amplitudes explain hardly depends on the basis: begun there, but still a first step
+    after = refine_state(trial, solver.amplitude, replace(before, steps=0))
+    change = model.weights * (after.rest**2 - before.rest**2)
+    excess = share_misfit(model, solver.amplitude, model.render(solver.amplitude), change)
+    needed = {}
+    for surface, (_, fewer) in shapes.items():
+        basis, coefficients = ahead.bases[surface], ahead.state.coefficients[surface]
+        freedom = 2 * solver.variance * (coefficients.size - fewer.size)
+        bending = coefficients @ basis.bending @ coefficients
+        needed[surface] = float(excess[model.parts[surface]].sum() / (freedom + bending))
+    return trial, after, needed
 
 
 def _refine(

@@ -36,6 +36,7 @@ from tofclip.recovery.surfaces.shapes import (
     QuadricBasis,
     SmoothBasis,
     evaluate_monomials,
+    fit_quadric,
 )
 from tofclip.shots import Streak
 from tofclip.threads import map_parallel, split_blocks, thread_count
@@ -43,6 +44,7 @@ from tofclip.units import SPEED_OF_LIGHT
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+Shape = tuple[SmoothBasis, FloatArray]  # of a surface's inverse depth, with its coefficients
 
 SLIT_PIXELS = 4
 # Rows that a part of a pixel spans where a surface is turned far, and parts along a side at most:
@@ -251,12 +253,11 @@ class SurfacePoints:
         masks = np.concatenate([self.masks, masks])
         return self.lay_out(masks, [*self.bases, *known], state, self._draw_points(len(masks)))
 
-    def straighten(self, quadratics: dict[int, FloatArray]) -> Self:
-        """Return the same surfaces, some of them quadratics of such coefficients, (6,) each."""
+    def reshape(self, shapes: dict[int, Shape]) -> Self:
+        """Return the same surfaces, some of them of other shapes."""
         other, state = copy.copy(self), self.state.copy()
         other.bases, other.functions = list(self.bases), list(self.functions)
-        for surface, coefficients in quadratics.items():
-            basis = SmoothBasis(self.bases[surface].image_shape)
+        for surface, (basis, coefficients) in shapes.items():
             state.coefficients[surface], other.bases[surface] = coefficients, basis
             other.functions[surface] = basis.evaluate(self.pixel[self.parts[surface]])
         other.place(state)
@@ -482,15 +483,18 @@ class SurfacePoints:
         apart = np.maximum((before != own).astype(int) + (behind != own), 1)
         return np.asarray((self.distance[behind] - self.distance[before]) / apart)
 
-    def find_quadratic(self, points: NDArray[np.intp], amplitude: Image) -> FloatArray:
-        """Return the coefficients, (6,), of the quadratic that is nearest to some points, the more the
-        brighter they are.
-        """
+    def find_quadratic(self, points: NDArray[np.intp], amplitude: Image) -> Shape:
+        """Return the quadratic that is nearest to some points, the more the brighter they are."""
         light = np.sqrt(amplitude[points].astype(np.float64))
         design = evaluate_monomials(self.pixel[points], self.masks.shape[1:])
         inverse = light * self.ray_length[points] / self.distance[points]
         nearest, *_ = np.linalg.lstsq(light[:, np.newaxis] * design, inverse)
-        return nearest.astype(np.float64)
+        return SmoothBasis(self.camera.image_shape), nearest.astype(np.float64)
+
+    def find_quadric(self, points: NDArray[np.intp]) -> Shape:
+        """Return the surface of second order in space that is nearest to some points."""
+        inverse = self.ray_length[points] / self.distance[points]
+        return fit_quadric(self.pixel[points], inverse, self.camera.image_shape)
 
     def estimate_deviation(self, covariances: Sequence[FloatArray]) -> FloatArray:
         """Standard deviations of all ranges, (points,), by covariances of surfaces' coefficients."""
