@@ -78,6 +78,8 @@ def _average_dark(counts: Float32Array, own: FloatArray, beside: FloatArray) -> 
     # without noise there is nothing else by which a row is known to be lit
     quiet = np.lexsort((own, beside))[: _count_quiet_rows(counts)]
     level = np.median(counts[quiet])
+    if np.all(counts[quiet] == level):  # nothing fluctuates: what other rows have is light
+        return float(level)
     spread = max(MAD_TO_SIGMA * np.median(np.abs(counts[quiet] - level)), LEAST_SPREAD_COUNT)
 
     def average(rows: IndexArray | BoolArray) -> float:
