@@ -71,9 +71,8 @@ CHANGED_EXCESS = 0.02  # beyond `CHANGED_RATIO` of what surfaces left unexplaine
 # more are bent.
 CERTAINLY_BENT, NO_DOUBT = 3.0, 100.0
 
-ROUND_FRACTION = (
-    0.3  # of a surface's usual brightness: the shape of what is dimmer says nothing of it
-)
+# Of a surface's usual brightness: the shape of what is dimmer says nothing of it.
+ROUND_FRACTION = 0.3
 
 DOUBLE_FRACTION = 0.2  # of a surface's lit points: that many beside another's may be the other's
 
@@ -393,42 +392,56 @@ def _measure_misfit(solver: AmplitudeSolver) -> float:
 def straighten_surfaces(
     solver: AmplitudeSolver,
 ) -> tuple[AmplitudeSolver, Refinement | None]:
-    """Replace splines by surfaces of second order, and both by quadratics, where these explain the shot as
-    well, after a step; return what that step knew as well, if there was one. Splines follow the returns of
-    frames, also where these are displaced, as behind gauze; the shot itself says whether the surface is bent.
+    """Replace splines and quadrics by quadratics where these explain the shot as well, after a step;
+    return what that step knew as well, if there was one. Splines follow the returns of frames, also where these
+    are displaced, as behind gauze; the shot itself says whether the surface is bent.
     """
     model = solver.model
     lit = np.bincount(model.surface, solver.amplitude > 0, len(model.bases))
-    bent = [k for k, basis in enumerate(model.bases) if not basis.is_quadratic and lit[k]]
-    if not bent:
+    straight = [k for k, basis in enumerate(model.bases) if not basis.is_quadratic and lit[k]]
+    if not straight:
         return solver, None
     ahead = copy.copy(model)
     before = refine_state(ahead, solver.amplitude)
-    usual = [
-        np.median(one[one > 0]) if one.any() else 0
-        for one in map(solver.amplitude.__getitem__, model.parts)
-    ]
-    bright = solver.amplitude > ROUND_FRACTION * np.array(usual)[model.surface]
-    points = {k: np.flatnonzero((model.surface == k) & bright) for k in bent}
-    splines = [k for k in bent if not isinstance(model.bases[k], QuadricBasis)]
-    round_ = {k: ahead.find_quadric(points[k]) for k in splines if points[k].size >= MIN_ROUND_PX}
-    if round_:
-        _, _, needed = _try_shapes(solver, ahead, before, round_)
-        round_ = {k: shape for k, shape in round_.items() if needed[k] <= 0}
-    if round_:
-        solver.model = model.reshape(round_)
-        return straighten_surfaces(solver)
-    straight = bent
     while straight:
         own = {k: np.flatnonzero(model.surface == k) for k in straight}
         plain = {k: model.find_quadratic(points, solver.amplitude) for k, points in own.items()}
         trial, after, needed = _try_shapes(solver, ahead, before, plain)
         most = max(needed.values())
         if most <= 1:
-            return AmplitudeSolver(trial, after.amplitude, solver.weight, solver), after
+            ahead, before = trial, after
+            break
         # one that is bent for certain takes light from others: these are tried again without it
         least = max(1.0, min(most, NO_DOUBT) / CERTAINLY_BENT)
         straight = [k for k in straight if needed[k] <= least]
+    return _round_splines(AmplitudeSolver(ahead, before.amplitude, solver.weight, solver), before)
+
+
+def _round_splines(
+    solver: AmplitudeSolver, found: Refinement
+) -> tuple[AmplitudeSolver, Refinement]:
+    """Replace splines by surfaces of second order where these explain the shot better, after a step from where
+    the step `found` led: returns of frames do not always tell which of them a melon is.
+    """
+    model, points = solver.model, {}
+    for surface, (basis, part) in enumerate(zip(model.bases, model.parts, strict=True)):
+        light = solver.amplitude[part]
+        if basis.is_quadratic or isinstance(basis, QuadricBasis) or not light.any():
+            continue
+        bright = light > ROUND_FRACTION * np.median(light[light > 0])
+        if np.count_nonzero(bright) >= MIN_ROUND_PX:
+            points[surface] = part.start + np.flatnonzero(bright)
+    if not points:
+        return solver, found
+    ahead = copy.copy(model)
+    before = refine_state(ahead, solver.amplitude, replace(found, steps=0))
+    shapes = {surface: ahead.find_quadric(own) for surface, own in points.items()}
+    trial, after, needed = _try_shapes(solver, ahead, before, shapes)
+    better = {surface: shape for surface, shape in shapes.items() if needed[surface] <= 0}
+    if 0 < len(better) < len(shapes):
+        trial, after, _ = _try_shapes(solver, ahead, before, better)
+    if better:
+        ahead, before = trial, after
     return AmplitudeSolver(ahead, before.amplitude, solver.weight, solver), before
 
 
