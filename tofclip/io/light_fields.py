@@ -13,6 +13,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,7 +58,8 @@ def read_exr_parts(path: Path) -> list[tuple[str, Channels]]:
                 columns, rows = (last - first + 1).tolist()
                 claimed += rows * columns * len(part.header["channels"]) * MAX_SAMPLE_BYTES
         require_bounded_size(path, "pixels", claimed, held, compressed=True)
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        # the library prints which parts it leaves out
+        with redirect_stdout(None), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [
                 (part.name(), {name: part.channels[name].pixels for name in part.channels})
                 for part in file.parts
