@@ -93,10 +93,9 @@ OTHER_ODDS, ENOUGH_SIGMAS, LEAST_DOUBT = np.array([4.64, -0.77, 1.06]), 15.0, 1e
 ABOUT_OTHERS_PX = 1
 
 # Standard deviations of a blur along the slit, px, that are tried until one explains the shot less well than
-# the one before, each for as many iterations; what has to be left of the misfit without it (0.3 of a shot
-# of 2000 photons; 0.997 of one that is not blurred, of leaves); and the change, relative, of one that is known.
-BLURS_PX, BLUR_ITERATIONS = (0.0, 0.7, 1.0, 1.3, 1.6, 2.0, 2.5, 3.0), 10
-LEAST_BLURRED, BLUR_ROUNDS, SETTLED_BLUR = 0.98, 3, 0.03
+# the one before, each for as many iterations, and what has to be left of the misfit without it (0.3 of a shot
+# of 2000 photons; 0.997 of one that is not blurred, of leaves).
+BLURS_PX, BLUR_ITERATIONS, LEAST_BLURRED = (0.0, 0.7, 1.0, 1.3, 1.6, 2.0, 2.5, 3.0), 10, 0.98
 
 Places = tuple[NDArray[Any], NDArray[Any], FloatArray]
 
@@ -171,15 +170,6 @@ def _fit_returns(
     # way to them.
     solver, begun = straighten_surfaces(solver)
     refinement, remainder = _refine(solver, begun, tick)
-    for _ in range(BLUR_ROUNDS):
-        before = solver.model.blur_px
-        if not before:
-            break
-        # ranges that were off hid a part of it
-        solver = _measure_blur(solver)
-        refinement, remainder = _refine(solver, refinement, tick)
-        if abs(solver.model.blur_px - before) < SETTLED_BLUR * before:
-            break
     if solver.model.pulse.reach:
         # what seemed a tail may have been ranges that were off
         plain = _measure_pulse(solver, np.inf)

@@ -148,6 +148,27 @@ def smooth_rows(images, kernel, lags, rows, below, aside, results):
 
 
 @fast_loop
+def smooth_columns(images, kernel, results):
+    """Smooth each row of images, (n, rows, columns), with a kernel that is even, of as many taps to either side;
+    beyond the images it is dark.
+    """
+    reach, columns = kernel.size // 2, images.shape[2]
+    for number in range(images.shape[0]):
+        for row in range(images.shape[1]):
+            line, result = images[number, row], results[number, row]
+            for i in range(columns):
+                result[i] = kernel[reach] * line[i]
+            for away in range(1, min(reach + 1, columns)):
+                share = kernel[reach + away]
+                before, behind = line[: columns - away], line[away:]
+                left, right = result[: columns - away], result[away:]
+                for i in range(before.size):
+                    left[i] += share * behind[i]
+                for i in range(before.size):
+                    right[i] += share * before[i]
+
+
+@fast_loop
 def add_up_even(values, level, lit, reach, totals):
     """Add up the values of pixels in the square about each that is lit whose level is the same or next."""
     rows, columns = values.shape

@@ -26,6 +26,7 @@ from tofclip.recovery.defects import estimate_noise
 from tofclip.recovery.surfaces.patches import MIN_BEHIND_FRACTION
 from tofclip.recovery.surfaces.points import SLIT_PIXELS, SurfacePoints, SurfaceState
 from tofclip.recovery.surfaces.pulse import (
+    EXTENT_SIGMAS,
     SPLINE_LEFT_VARIANCE,
     Image,
     ShotPulse,
@@ -166,10 +167,15 @@ class SurfaceModel(SurfacePoints):
         return other
 
     def _blur(self, images: Image) -> Image:
-        """Its own adjoint."""
+        """Smooth images, (n, rows, columns), along the slit; its own adjoint."""
+        from tofclip.recovery.surfaces.kernels import smooth_columns
+
         if not self.blur_px:
             return images
-        return scipy.ndimage.gaussian_filter1d(images, self.blur_px, mode="constant")
+        kernel = make_pulse(self.blur_px, int(np.ceil(EXTENT_SIGMAS * self.blur_px)), 0.0)
+        blurred = np.empty_like(images, order="C")
+        smooth_columns(images, kernel, blurred)
+        return blurred
 
     def unexplained(self, amplitude: Image) -> float:
         """What is left of the signal, as a fraction."""
@@ -185,7 +191,7 @@ class SurfaceModel(SurfacePoints):
         rows, columns = box = self._find_box(view, part)
         first, last = (int(rows[0]), int(rows[-1]) + 1) if rows.size else (0, 0)
         top, bottom = place.first_row + first, place.first_row + last
-        reach = int(np.ceil(4 * self.blur_px))
+        reach = int(np.ceil(EXTENT_SIGMAS * self.blur_px))
         left, right = (
             min(max(place.first_column + one, 0), self.shape[1])
             for one in (columns.start - reach, columns.stop + reach)
@@ -302,7 +308,7 @@ class SurfaceModel(SurfacePoints):
 
     def _gather_lit(self, image: Image, squared: bool = False) -> Image:
         """A' of the rows of an image that light reaches."""
-        seen = self._blur(image) if squared else self._spread_back(image)
+        seen = self._blur(image[np.newaxis])[0] if squared else self._spread_back(image)
         shares = self.share_out(partial(self._gather, seen, squared=squared), self.camera.views)
         return reduce(np.add, shares)
 
@@ -310,7 +316,7 @@ class SurfaceModel(SurfacePoints):
         """The adjoint of `_trail`, from the rows of an image that light reaches."""
         from tofclip.recovery.surfaces.kernels import smooth_rows
 
-        image = self._blur(image)
+        image = self._blur(image[np.newaxis])[0]
         if not self.pulse.reach:
             return image
         rows = self._lit_before
