@@ -91,12 +91,8 @@ PAGE_GROUPS = {
 # by name only: they need an extra program, recorded data, another device or much time
 STUDY_GROUPS = {
     "camera": "Light-field cameras: one model each way",
-    "quality": "Quality of pictures of recorded light fields",
-    "accuracy": "Ranges from counted photons",
     "device": "The same on another device",
     "corner": "Around the corner: beyond lattices",
-    "sequence": "Many shots",
-    "driver": "Instruments, the whole path",
     "viewer": "The viewer in a browser",
 }
 TABLE = Path(__file__).with_name("cases.csv")

@@ -1,27 +1,18 @@
-"""Instruments: their bytes to records and photons to histograms, against a copy of the bytes, and the
-whole path (emulator, driver, ring, decoder, file), against decoding alone.
-"""
+"""Instruments: their bytes to records and photons to histograms, against a copy of the bytes."""
 
 from __future__ import annotations
 
-import atexit
-import itertools
-import tempfile
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-import devices
 from apps.benchmarks.harness import Action, Prepare, PreparedCase
 from devices.emulation.linospad2 import LASER_PERIOD_S, draw_uneven_calibration
-from devices.emulation.timetag import CLOCK_HZ, MAX_TICK, PoissonStream
 from devices.histogram import BinAxis, StampHistogram, TagHistogram
 from devices.linospad2 import STAMP_DTYPE, LinoSpad2Codec
-from devices.recorder import record_source
-from devices.source import Records, Source, as_bytes
-from devices.timetag_codec import RECORD_BYTES, RECORD_DTYPE, TimeTagCodec
+from devices.source import Records, as_bytes
+from devices.timetag_codec import RECORD_DTYPE, TimeTagCodec
 
 MEGA = 10**6
 FILL_FRACTION = 0.5  # of LinoSPAD2's words hold a time stamp
@@ -76,76 +67,9 @@ def prepare_tag_histogram(millions: int) -> PreparedCase:
     return PreparedCase(lambda: histogram.add(records), make_copy(records), millions)
 
 
-ADDRESS = "sim+timetag://?seed=1"
-PIECE_BYTES = (1 << 19) // RECORD_BYTES * RECORD_BYTES
-RATE_HZ = 1.28e7
-
-
-def read_records(source: Source, size_mb: int) -> None:
-    """Read and decode a source until `size_mb` megabytes have come, and close it."""
-    wanted, records = size_mb * MEGA // RECORD_BYTES, 0
-    with source:
-        while records < wanted:
-            batch = source.read()
-            if batch is None:
-                break
-            records += len(batch.records)
-        source.stop()
-
-
-def make_decoding(size_mb: int) -> Action:
-    """The bare decoder on as many bytes, in pieces as the driver hands them over."""
-    codec = TimeTagCodec()
-    count = PIECE_BYTES // RECORD_BYTES
-    words = as_bytes(PoissonStream(RATE_HZ, CLOCK_HZ, 1).next_words(count, MAX_TICK))
-    pieces = size_mb * MEGA // PIECE_BYTES
-
-    def decode() -> None:
-        for _ in range(pieces):
-            codec.decode(words, codec.start)
-
-    return decode
-
-
-def make_recording(size_mb: int) -> Path:
-    """A recording of so much, in a folder that goes when the process ends."""
-    folder = tempfile.TemporaryDirectory()
-    atexit.register(folder.cleanup)
-    path, source = Path(folder.name) / "run.h5", devices.open(ADDRESS)
-
-    def stop_when_enough(_: float) -> None:
-        if path.stat().st_size > size_mb * MEGA:
-            source.stop()
-
-    record_source(source, path, watch=stop_when_enough)
-    return path
-
-
-def prepare_recorder(size_mb: int) -> PreparedCase:
-    """A source of bytes, here a recording, into a file."""
-    path, number = make_recording(size_mb), itertools.count()
-
-    def record() -> None:
-        copy = path.with_name(f"copy{next(number)}.h5")
-        record_source(devices.open(f"file://{path}"), copy)
-        copy.unlink()
-
-    return PreparedCase(record, make_decoding(size_mb), size_mb)
-
-
-def prepare_reading(recorded: bool, size_mb: int) -> PreparedCase:
-    """From the emulated instrument through pyusb's own code, or from a recording, to records."""
-    address = f"file://{make_recording(size_mb)}" if recorded else ADDRESS
-    read = partial(read_records, size_mb=size_mb)
-    return PreparedCase(lambda: read(devices.open(address)), make_decoding(size_mb), size_mb)
-
-
 PREPARE: dict[str, Prepare] = {
     "decode-linospad2": prepare_board_decoding,
     "decode-timetag": prepare_tag_decoding,
     "decode-stamps": prepare_stamp_histogram,
     "decode-tags": prepare_tag_histogram,
-    "driver-timetag": partial(prepare_reading, False),
-    "driver-record": prepare_recorder,
-    "driver-replay": partial(prepare_reading, True),
 }

@@ -2,19 +2,13 @@
 lensless camera beside another program's, each against the bare products.
 
 What is timed of a recovery is what a user waits for: the choice of the prior's weight is part of it.
-The quality cases recover recorded and rendered light fields, which `TOFCLIP_DATA` names, as a user
-would, without the truth: NMSE in per cent of shift-and-add of the true views, mean and spread over
-seeds of the angles or codes. Their limits are what total variation with the best weight reached.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 import time
-from dataclasses import replace
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,13 +25,9 @@ from apps.benchmarks.harness import (
     ask_peer,
 )
 from tofclip.arrays import AnyArray, Float32Array
-from tofclip.errors import InputError
-from tofclip.io.light_fields import read_light_field
 from tofclip.light_field import LightField
 from tofclip.light_field.views import (
     CameraSetup,
-    ClipMeasurement,
-    corrupt_measurement,
     measure,
 )
 from tofclip.metrics import nmse
@@ -193,74 +183,6 @@ def prepare_camera(name: str, side: int) -> PreparedCase:
     )
 
 
-BORDER_PX = 12
-SEEDS = 5
-
-
-LETTERS = "render_letters", -0.3
-# Light field, shear, encoder, preset, and the NMSE in per cent that must not be exceeded, by the sampling
-# ratio in per cent; behind the last dash of a name: measurements in per cent that are wildly wrong.
-QUALITY: dict[str, tuple[str, float, str, str, dict[int, float]]] = {
-    "letters-line-fast": (*LETTERS, "line", "fast", {25: 17.0, 50: 8.5, 100: 4.5, 200: 3.0}),
-    "letters-line-quality": (*LETTERS, "line", "quality", {25: 10.0, 50: 4.5, 100: 3.0, 200: 2.0}),
-    "letters-single-pixel-fast": (*LETTERS, "single-pixel", "fast", {25: 7.6, 50: 4.3, 100: 2.6}),
-    "letters-single-pixel-quality": (
-        *(*LETTERS, "single-pixel", "quality"),
-        {25: 5.5, 50: 3.0, 100: 1.8},
-    ),
-    **{
-        f"letters-line-{preset}-{percent}%": (*LETTERS, "line", preset, {100: 5.5})
-        for preset in ("fast", "quality")
-        for percent in (1, 5, 10)
-    },
-    "planes-line-fast": (
-        *("render_planes", 0.0, "line", "fast"),
-        {25: 10.8, 50: 6.9, 100: 4.1, 200: 2.6},
-    ),
-    "antinous-line-fast": (
-        *("hci_antinous", 0.0, "line", "fast"),
-        {25: 2.1, 50: 1.2, 100: 0.7, 200: 0.5},
-    ),
-}
-
-
-def prepare_quality(name: str, ratio_percent: int) -> PreparedCase:
-    """A recovery with the weight that the search found, against the products it needs."""
-    source, shear, encoder, preset, limits = QUALITY[name]
-    wrong = int(name.rpartition("-")[2][:-1]) / 100 if name.endswith("%") else 0.0
-    path = Path(os.environ.get("TOFCLIP_DATA", ""), "lightfields", f"{source}.npz")
-    if not path.is_file():
-        raise InputError(f"{path} is missing: TOFCLIP_DATA names the folder of recorded data")
-    light_field = read_light_field(path)
-    truth = light_field.refocus(shear)
-    settings = ClipRecovery(preset=preset, data_term="huber" if wrong else "squares")
-
-    def measure_seed(seed: int) -> ClipMeasurement:
-        setup = CameraSetup(encoder, ratio_percent / 100, seed)
-        return corrupt_measurement(measure(light_field, setup), None, wrong)
-
-    def recover(seed: int) -> tuple[float, float]:
-        found = settings.recover(measure_seed(seed), shear)
-        return 100 * nmse(found.picture, truth, BORDER_PX), found.seconds_weight
-
-    def judge() -> dict[str, float]:
-        errors, searches = zip(*map(recover, range(SEEDS)), strict=True)
-        return {
-            "nmse_percent": np.mean(errors),
-            "spread_percent": np.std(errors, ddof=1),
-            "limit_percent": limits[ratio_percent],
-            "weight_search_s": np.median(searches),
-        }
-
-    measured = measure_seed(0)
-    camera = measured.camera()
-    first = settings.recover(measured, shear)
-    solver = replace(settings, weight=first.weight)
-    model = camera.weighting() @ camera.model(shear)
-    products = repeat_products(model, first.iterations)
-    return PreparedCase(lambda: solver.recover(measured, shear), products, 1, figures=judge)
-
-
 PREPARE: dict[str, Prepare] = {
     "clip-1d": partial(prepare_recovery, "line", None),
     "clip-0d": partial(prepare_recovery, "single-pixel", None),
@@ -268,5 +190,4 @@ PREPARE: dict[str, Prepare] = {
     "clip-given": partial(prepare_recovery, "diffuser", GIVEN_WEIGHT),
     "clip-lensless": prepare_lensless,
     **{f"camera-{name}": partial(prepare_camera, name) for name in CAMERAS},
-    **{f"quality-{name}": partial(prepare_quality, name) for name in QUALITY},
 }

@@ -19,7 +19,7 @@ def bench(
     name: str = arg(
         "NAME",
         "recovery, clip, depth, streaming, rsd, propagation, confocal, backprojection, decode, or one of a group, as "
-        "recovery-l1. Studies, by name only: camera, quality, accuracy, device, corner, sequence, driver, viewer.",
+        "recovery-l1. Studies, by name only: camera, device, corner, viewer.",
         "all",
     ),
     page: Path | None = opt("MD", "A page of the figures to write.", shown="none"),

@@ -31,7 +31,7 @@ CASES = find_cases("all")
 # Sizes at which a case, or a study that needs nothing but this program, is over at once; 16 where
 # none is given.
 SMALL = {"recovery": 8, "depth": 200, "streaming": 200, "decode": 1, "recovery-projection": 16}
-STUDIES = {"camera": 16, "corner-time": 12, "corner-scattered": 12, "driver": 1}
+STUDIES = {"camera": 16, "corner-time": 12, "corner-scattered": 12}
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_every_case_has_a_name_and_a_place_on_the_page(shell):
     with pytest.raises(InputError, match="recovery, clip"):
         find_cases("nothing")
     # studies are run by name only
-    for group in ("camera", "quality", "accuracy", "device", "corner", "driver"):
+    for group in ("camera", "device", "corner"):
         assert {case.group for case in find_cases(group)} == {group}
     told = shell("bench --help").out
     assert all(group in told for group in (*PAGE_GROUPS, *STUDY_GROUPS))
