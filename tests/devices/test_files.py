@@ -133,26 +133,6 @@ def test_what_every_file_refuses(write, kind, monkeypatch):
     refuse(f"file://{path}", "no such file", StorageError)
 
 
-@pytest.mark.parametrize(
-    ("lengths", "resolution", "problem"),
-    [
-        ((), 1e-12, "histograms of no bins"),
-        ((3, 4), 1e-12, r"\[3, 4\] bins"),
-        ((3,), 0.0, r"last 0\.0 s"),
-    ],
-)
-def test_histograms_that_cannot_be(
-    write,
-    lengths,
-    resolution,
-    problem,
-    monkeypatch,
-):
-    blocks = [np.ones(length) for length in lengths]
-    monkeypatch.setattr(files, "read_sdt_blocks", lambda path: (blocks, resolution))
-    refuse(f"file://{write('sdt')}", problem, FileFormatError)
-
-
 @pytest.mark.parametrize("pieces", [1, 7, 40])
 def test_a_ptu_is_the_same_in_pieces(write, pieces, monkeypatch):
     """Photons that are read a piece at a time, as of a file that does not fit into memory."""

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.special import ndtr
 from scipy.stats import binom, exponnorm
 
@@ -51,16 +49,6 @@ def detector():
 
 def compute_rms(values):
     return np.sqrt(np.mean(np.square(values)))
-
-
-@settings(max_examples=20)
-@given(photons=st.floats(1, 1e5), fwhm=st.floats(30e-12, 300e-12))
-def test_without_background_the_bound_is_sigma_over_root_photons(photons, fwhm):
-    # a bin hides where in it a photon came
-    sigma = np.sqrt(fwhm**2 / (8 * np.log(2)) + (fwhm / 10) ** 2 / 12)
-    bound = compute_range_bound(Pulse.gaussian(fwhm), fwhm / 10, photons, 0.0)
-    # the pulse is cut at two widths; the edge tells a little that a tail would not
-    assert bound == pytest.approx(metres(sigma) / np.sqrt(photons), rel=2e-3)
 
 
 @pytest.mark.parametrize(

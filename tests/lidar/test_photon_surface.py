@@ -6,7 +6,6 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from scipy.io import loadmat
 
 from tofclip.camera import Camera
 from tofclip.errors import InputError
@@ -54,48 +53,6 @@ def test_photons_that_show_no_surface_are_refused_for_what_they_are(cube, proble
     pulse = None if "pulse" in problem else Pulse.gaussian(FWHM)
     with pytest.raises(InputError, match=problem):
         estimate_surface(PhotonImage.from_cube(cube, BIN), pulse)
-
-
-def test_events_and_cubes_are_the_same_photons():
-    counts = np.random.default_rng(0).poisson(0.3, (4, 5, 16))
-    photons = PhotonImage.from_cube(counts, BIN)
-    np.testing.assert_array_equal(photons.histograms(slice(0, 20)), counts.reshape(20, 16))
-    pixel, bins = np.nonzero(counts.reshape(20, 16))
-    again = PhotonImage.from_events(
-        np.repeat(pixel, counts[counts > 0]), np.repeat(bins, counts[counts > 0]), (4, 5), BIN, 16
-    )
-    np.testing.assert_array_equal(again.histograms(slice(0, 20)), counts.reshape(20, 16))
-    assert photons.photons == counts.sum()
-    one, other = photons.split(0.25, 0)
-    assert one.photons + other.photons == counts.sum()
-    np.testing.assert_array_equal(
-        one.histograms(slice(0, 20)) + other.histograms(slice(0, 20)), counts.reshape(20, 16)
-    )
-
-
-@pytest.mark.nightly
-def test_a_recorded_face_is_as_its_long_exposure_shows(shared_data):
-    """With the pulse that its authors name; with the one that is learnt it is a golden figure."""
-    folder = shared_data / "photons"
-    if not folder.is_dir():
-        pytest.skip("no recorded photons")
-    cells = loadmat(folder / "shin2015_face.mat")["Ts"]
-    number = np.array([cell.size for cell in cells.ravel()])
-    times = np.concatenate([cell.ravel() for cell in cells.ravel()])
-    pixel = np.repeat(np.arange(number.size), number)
-    truth = loadmat(folder / "shin2015_face_truth.mat")["D_true"][:340, 3:343]
-    truth = np.array([[float(cell.item()) for cell in row] for row in truth])
-    head = truth < 3990  # what is further away has no true range
-    found = estimate_surface(
-        PhotonImage.from_events(pixel, times, cells.shape, 8e-12), Pulse.gaussian(848e-12)
-    )
-    error = found.range[head] - truth[head] * SPEED_OF_LIGHT / 2 * 8e-12
-    error -= np.median(error)
-    assert np.mean(np.abs(error) < 12e-3) >= 0.97
-    assert np.sqrt(np.mean(error**2)) <= 37e-3
-    # The long exposure has errors of its own: two halves of these photons, pooled over 8 x 8 pixels,
-    # both lie 3.2 mm off it, and 0.2 mm off the surface that is found.
-    assert 0.7 <= compute_robust_z(error, np.hypot(found.range_sigma[head], 3.2e-3)) <= 1.15
 
 
 def test_two_layers_are_both_found_and_none_twice():

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Detection, Pulse, Returns, depth
-from tofclip.lidar.fit_kernels import take_gauss_newton_step
 from tofclip.lidar.pulse import PhaseTable
 from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
@@ -328,17 +327,6 @@ def test_the_confidence_is_the_scatter_of_ranges_where_noise_does_not_grow_with_
     error = found.range[strongest] - range_of(arrivals)[found.x[strongest]]
     assert np.count_nonzero(strongest) == pixels
     assert np.median(found.confidence[strongest]) == pytest.approx(np.std(error), rel=0.15)
-
-
-def test_a_step_of_the_fit_is_a_bin_at_most():
-    """Far from the least squares the linear model says nothing: a longer step would lose the pulse."""
-    times = even_times(20)
-    for slope_of_the_rest in (-1e3, 1e3):
-        own = np.array([times[10], 5.0, 6, 15, np.inf])
-        sums = (1.0, 0.0, 1 / BIN**2, 5.0, slope_of_the_rest / BIN)
-        take_gauss_newton_step(times, sums, own)
-        assert own[0] == pytest.approx(times[10] - np.sign(slope_of_the_rest) * BIN, abs=1e-3 * BIN)
-        assert (own[1], own[4]) == (5.0, pytest.approx(1.0))
 
 
 def test_an_echo_weaker_than_the_limit_of_its_pixel_is_left_out():

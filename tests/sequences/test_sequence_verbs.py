@@ -70,16 +70,6 @@ def test_shots_to_frames_to_clouds_on_a_cluster(run, scheduler, few, tmp_path):
     assert len(list(clouds.glob("*.ply"))) == 3
 
 
-def test_a_sequence_here_is_that_of_single_shots(run, few, tmp_path):
-    (few / "shot1.h5").unlink()
-    method = "--method l1 --iterations 3"
-    assert run(f"recover {few} --out {tmp_path}/many {method}")[0] == 0
-    assert run(f"recover {few}/shot2.h5 --out {tmp_path}/one.h5 {method}")[0] == 0
-    one, other = Frames.load(tmp_path / "one.h5"), Frames.load(tmp_path / "many" / "shot2.h5")
-    assert (one.values == other.values).all()
-    assert one.provenance["settings"] == other.provenance["settings"]
-
-
 def test_a_sweep_has_a_folder_for_each_combination(run, recorded, tmp_path):
     line = f"recover {recorded}/shots/shot[0].h5 --out {tmp_path}/out --method l1"
     assert run(f"{line} --sweep iterations=1,2 --sweep weight=1e-3")[0] == 0

@@ -163,24 +163,6 @@ def test_a_stream_of_rows_far_shorter_than_the_pulse_shows_what_its_shots_show(c
     assert np.median(later.range) == pytest.approx(np.median(found.range), abs=7e-4)
 
 
-@pytest.mark.parametrize("prepared", [False, True])
-def test_leaving_clouds_early_closes_their_source(prepared):
-    made, closed = shots(1), Event()
-
-    def source():
-        try:
-            while True:
-                yield made[0]
-        finally:
-            closed.set()
-
-    held = source()  # else letting go of it would close it as well
-    clouds = stream_clouds(held, RangingPipeline.for_shot(made[0]) if prepared else None)
-    next(clouds)
-    clouds.close()
-    assert closed.wait(5)
-
-
 class CountingExecutor(ThreadPoolExecutor):
     """One worker, which begins when it is told to; counts what it holds at most."""
 

@@ -293,17 +293,8 @@ def test_pictures_to_begin_at_save_iterations_at_the_same_objective():
     reached = cold[-1] * (1 + 1e-2)
     cold_iterations, warm_iterations = (int(np.argmax(one <= reached)) for one in (cold, warm))
     assert warm_iterations <= cold_iterations / 2
-
-
-@l1_and_tv(1e-2, 9)
-def test_the_objective_at_the_beginning_is_that_of_the_pictures_given(method):
-    operator, random = projection(), np.random.default_rng(7)
-    measurements = operator(np.maximum(random.standard_normal((12, 11, 2)), 0))
-    before = method.recover(operator, measurements)
-    after = replace(method, iterations=1).recover(operator, measurements, start=before.frames)
-    assert after.objective[0] == pytest.approx(before.objective[-1], rel=1e-9)
     with pytest.raises(ShapeError, match="pictures to begin at"):
-        method.recover(operator, measurements, start=before.frames[:1])
+        method.recover(operator, second, start=before.frames[:1])
 
 
 def denoise(prior, noisy, calls):
