@@ -138,7 +138,11 @@ class EmulatedKit:
     def _run(self) -> None:
         options, began = self._options, time.monotonic()
         while not self._closing.is_set():
-            self._read_commands(0.0 if self._measuring else 0.02)
+            wait_s = 0.0 if self._measuring else 0.02
+            asked, _, _ = select.select([self._controller], [], [], wait_s)
+            for letter in os.read(self._controller, 64) if asked else b"":
+                if options.start and letter in b"ms":
+                    self._measuring = letter == b"m"[0]
             if not self._measuring:
                 began = time.monotonic() - self.taken / options.rate
                 continue
@@ -152,12 +156,6 @@ class EmulatedKit:
                 lines[len(lines) // 2] = lines[len(lines) // 2][:20]
             if not (options.lost and (number + 1) % options.lost == 0):
                 self._write(b"".join(lines))
-
-    def _read_commands(self, timeout: float) -> None:
-        ready, _, _ = select.select([self._controller], [], [], timeout)
-        for letter in os.read(self._controller, 64) if ready else b"":
-            if self._options.start and letter in b"ms":
-                self._measuring = letter == b"m"[0]
 
     def _write(self, data: bytes) -> None:
         left = memoryview(data)

@@ -53,7 +53,12 @@ def estimate_skew(counts: Float32Array, camera: Camera) -> SkewEstimate:
     reference. `CalibrationError` where a view's curve does not resemble the reference's, or the picture
     is not as wide as the camera's slit.
     """
-    curves = _extract_structure(sum_view_energies(counts, camera))
+    from scipy.ndimage import gaussian_filter1d
+
+    # The root takes range away, as near objects outshine far ones by 1/r^2, and gives bright and dim
+    # returns the same noise, so that a single bright one does not decide.
+    roots = np.sqrt(np.maximum(sum_view_energies(counts, camera), 0))
+    curves = roots - gaussian_filter1d(roots, TREND_ROWS, axis=1)
     reference = int(np.argmin(np.abs(camera.view_positions)))
     found = [
         (0.0, 0.0, 1.0) if view == reference else _match_curves(curve, curves[reference])
@@ -82,16 +87,6 @@ def sum_view_energies(counts: Float32Array, camera: Camera) -> FloatArray:
     half = min(camera.image_shape[1] // 2, int(pitch) // 2)
     edges = [(max(0, round(c) - half), round(c) + half + 1) for c in camera.centres_px]
     return np.array([signal[:, first:last].sum(axis=1, dtype=np.float64) for first, last in edges])
-
-
-def _extract_structure(energies: FloatArray) -> FloatArray:
-    """Compress the range (near objects outshine far ones by 1/r^2) and take the slow trend away."""
-    from scipy.ndimage import gaussian_filter1d
-
-    # The root gives bright and dim returns the same noise, so that a single bright one does not
-    # decide.
-    compressed = np.sqrt(np.maximum(energies, 0))
-    return compressed - gaussian_filter1d(compressed, TREND_ROWS, axis=1)
 
 
 def _spread_by_chance(curve: FloatArray, reference: FloatArray) -> float:
@@ -177,11 +172,18 @@ def register_views(
         measurement = measure(counts, saturated, camera)
         chosen = _select_frames(measurement)
         part = measurement.select(chosen)
-        groups = _group_by_shear(camera, times, chosen)
-        model = _Model(camera, groups)
-        pictures = model.recover(part, progress)
-        predicted = model.predict(pictures)
-        misfit, good = part.values - predicted, part.valid
+        groups: Groups = [(slice(0, chosen.size), 0.0)]
+        if times is not None and camera.lenslet_pitch > 0:
+            distance = np.maximum(SPEED_OF_LIGHT * times[chosen] / 2, MIN_RANGE_M)
+            groups = split_by_shear(camera, distance, SHEAR_TOLERANCE_PX)
+        found, predicted = list[Float32Array](), list[Float32Array]()
+        for frames, shear in groups:
+            operator, some = camera.operator(shear), part.select(frames)
+            one = REGISTRATION_METHOD.recover(operator, some.values, some.valid, progress)
+            found.append(np.moveaxis(one.frames, 0, -1))
+            predicted.append(operator(found[-1]))
+        pictures = np.ascontiguousarray(np.concatenate(found, axis=-1))
+        misfit, good = part.values - np.concatenate(predicted, axis=1), part.valid
         residual = np.linalg.norm(misfit[good]) / np.linalg.norm(part.values[good])
         residuals.append(float(residual))
         best = min(best, (residuals[-1], camera), key=lambda pair: pair[0])
@@ -211,35 +213,6 @@ def _select_frames(measurement: Measurement) -> IndexArray:
 
 Groups = list[tuple[slice, float]]
 """Consecutive ones of the chosen frames, and their shear in pixels per view step."""
-
-
-def _group_by_shear(camera: Camera, times: FloatArray | None, chosen: IndexArray) -> Groups:
-    """Cut the chosen frames where the shear of their range has changed."""
-    if times is None or camera.lenslet_pitch <= 0:
-        return [(slice(0, chosen.size), 0.0)]
-    distance = np.maximum(SPEED_OF_LIGHT * times[chosen] / 2, MIN_RANGE_M)
-    return split_by_shear(camera, distance, SHEAR_TOLERANCE_PX)
-
-
-class _Model:
-    """The operators of a camera for the chosen frames, by groups."""
-
-    def __init__(self, camera: Camera, groups: Groups) -> None:
-        self._parts = [(frames, camera.operator(shear)) for frames, shear in groups]
-
-    def recover(self, part: Measurement, progress: Progress) -> Float32Array:
-        """Recover the chosen frames, (rows, columns, frames)."""
-        pictures = []
-        for frames, operator in self._parts:
-            some = part.select(frames)
-            found = REGISTRATION_METHOD.recover(operator, some.values, some.valid, progress)
-            pictures.append(found.frames)
-        return np.ascontiguousarray(np.moveaxis(np.concatenate(pictures), 0, -1))
-
-    def predict(self, pictures: Float32Array) -> Float32Array:
-        """Return what the camera would measure of the pictures, (columns, frames)."""
-        seen = [operator(pictures[..., frames]) for frames, operator in self._parts]
-        return np.concatenate(seen, axis=1)
 
 
 def _refine_camera(
@@ -308,7 +281,8 @@ class _Evidence:
             angle_uncertainty=np.empty(0),
             centre_uncertainty_px=np.empty(0),
         )
-        predicted = _Model(alone, self.groups).predict(self.pictures)
+        seen = [alone.operator(shear)(self.pictures[..., part]) for part, shear in self.groups]
+        predicted = np.concatenate(seen, axis=1)
         half = camera.image_shape[1] // 2
         middle = round(camera.centres_px[view])
         window = slice(max(0, middle - half), middle + half + 1)

@@ -54,7 +54,11 @@ class PointSpreadConvolution(LinearOperator):
 
         sensor_shape = image_shape if sensor_shape is None else sensor_shape
         super().__init__(image_shape, sensor_shape, dtype)
-        spread, centre = _crop_to_support(validate_point_spread(point_spread, image_shape))
+        spread = validate_point_spread(point_spread, image_shape)
+        # dark rows and columns are cut off; the centre stays where it was
+        lit = [np.flatnonzero(spread.any(axis=other)) for other in (1, 0)]
+        centre = [size // 2 - int(one[0]) for size, one in zip(spread.shape, lit, strict=True)]
+        spread = spread[lit[0][0] : lit[0][-1] + 1, lit[1][0] : lit[1][-1] + 1]
         sides = zip(image_shape, sensor_shape, strict=True)
         first = [image // 2 - sensor // 2 for image, sensor in sides]
         # long enough that no period's copy of the picture reaches the sensor
@@ -104,14 +108,6 @@ def validate_point_spread(point_spread: ArrayLike, image_shape: tuple[int, int])
         "a point-spread function that is dark everywhere shows nothing; check its background",
     )
     return spread
-
-
-def _crop_to_support(spread: FloatArray) -> tuple[FloatArray, list[int]]:
-    """Cut a PSF down to where it is not zero; return it and where its origin lies then."""
-    lit = [np.flatnonzero(spread.any(axis=other)) for other in (1, 0)]
-    cut = spread[lit[0][0] : lit[0][-1] + 1, lit[1][0] : lit[1][-1] + 1]
-    # the centre stays where it was, although dark rows and columns are gone
-    return cut, [size // 2 - int(axis[0]) for size, axis in zip(spread.shape, lit, strict=True)]
 
 
 def alias_free_length(image: int, sensor: int, spread: int, first: int, centre: int) -> int:

@@ -14,7 +14,6 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from threading import Condition, RLock, Thread
 from time import perf_counter
@@ -393,17 +392,13 @@ def _make_cloud(
     pipeline: CloudPipeline, shot: LiveShot
 ) -> tuple[LiveShot, Returns, PointCloud, dict[str, float]]:
     """Return a shot with its returns and cloud, and what each step took, s."""
-    ends = [perf_counter()]
-    rectified = pipeline.rectify(shot)
-    ends.append(perf_counter())
-    recovered = pipeline.recover(rectified)
-    ends.append(perf_counter())
-    returns = pipeline.search(recovered)
-    ends.append(perf_counter())
-    cloud = point_cloud(returns)
-    ends.append(perf_counter())
-    seconds = [end - begin for begin, end in pairwise(ends)]
-    return shot, returns, cloud, dict(zip(STEPS, seconds, strict=True))
+    made, seconds = list[Any]([shot]), dict[str, float]()
+    steps = pipeline.rectify, pipeline.recover, pipeline.search, point_cloud
+    for name, work in zip(STEPS, steps, strict=True):
+        began = perf_counter()
+        made.append(work(made[-1]))
+        seconds[name] = perf_counter() - began
+    return shot, made[-2], made[-1], seconds
 
 
 def _prepend_shot(

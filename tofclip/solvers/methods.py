@@ -9,7 +9,7 @@ on the same device. Memory beyond the result is bounded: frames are worked on in
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import prod
 from typing import Protocol, Self
@@ -79,22 +79,6 @@ class StoppingRule:
             )
         require(self.further >= 0, f"further iterations must not be negative, got {self.further}")
 
-    def _follows_noise(self, objective: Sequence[Array]) -> bool:
-        """Whether a block of little more than noise has come as near to it as it should, given its
-        objective before the first and after every iteration.
-        """
-        before, last = objective[-2], objective[-1]
-        noisy = last > NOISE_FRACTION * objective[0]
-        return bool(noisy & (before - last < self.noise_fall * last))
-
-    def _continues(self, objective: Sequence[Array]) -> bool:
-        """Whether a block goes on after its iterations."""
-        done = len(objective) - 1
-        if not (done >= GAP_INTERVAL and self.iterations <= done < self.iterations + self.further):
-            return False
-        fall = objective[-1 - GAP_INTERVAL] - objective[-1]
-        return bool(fall > MIN_FURTHER_FALL * objective[-1])
-
 
 class IterativeSolver(Protocol):
     """What the loop needs to know of a solver."""
@@ -148,12 +132,15 @@ def iterate(
         done += 1
         solver.step()
         objective.append(xp.sum(solver.objective))
+        last = objective[-1]
+        fall = objective[-2] - last
         if stopping.tolerance > 0:
             # a refused step changes nothing, which does not mean that the block has converged
-            little = objective[-2] - objective[-1] < stopping.tolerance * objective[-1]
+            little = fall < stopping.tolerance * last
             converged = bool(little & ~xp.any(solver.rejected))
         if stopping.noise_fall > 0:
-            converged |= stopping._follows_noise(objective)
+            noisy = last > NOISE_FRACTION * objective[0]
+            converged |= bool(noisy & (fall < stopping.noise_fall * last))
         if stopping.gap > 0 and (converged or done == limit or done % GAP_INTERVAL == 0):
             gap = solver.duality_gap()
             if gap is not None:
@@ -163,10 +150,11 @@ def iterate(
             progress(frames * (most - done + 1))
             break
         progress(frames)
-        if done == limit:
-            if stopping._continues(objective):
+        if done == limit < most:
+            before = objective[-1 - GAP_INTERVAL] if done >= GAP_INTERVAL else last
+            if before - last > MIN_FURTHER_FALL * last:
                 limit = min(done + GAP_INTERVAL, most)
-            elif done < most:
+            else:
                 progress(frames * (most - done))
     excess = float("nan") if gap is None else float(xp.sum(gap))
     return IterationHistory(to_numpy(xp.stack(objective)), converged, excess)
