@@ -105,12 +105,6 @@ def test_pictures_without_a_time_axis(tmp_path):
     assert streak.times[2] == pytest.approx(2e-12)
 
 
-def test_recorded_pictures(shared_data):
-    with devices.open(f"file://{shared_data}/devices/streak/operate_mode.img") as source:
-        assert next(source).records["counts"].shape == (1, 512, 672)
-        assert source.info.details["camera"] == "Orca R2"
-
-
 @pytest.mark.parametrize("kind", ["ptu", "phu", "sdt", "img"])
 def test_what_every_file_refuses(write, kind, monkeypatch):
     path = write(kind)

@@ -102,26 +102,6 @@ def test_stamps_are_shared_out_over_their_codes(board, period):
     assert_allclose(histogram.counts.sum(), expected.sum(), rtol=1e-5)
 
 
-def test_even_light_gives_even_bins_whatever_the_codes(board):
-    """Uncorrected, the ripple is as deep as the codes are uneven; corrected, only the photons' own
-    noise remains.
-    """
-    random = np.random.default_rng(6)
-    photons = 400_000
-    pixels = np.full(photons, 40)
-    records = stamps_at(random.uniform(10e-9, 110e-9, photons), pixels, board)
-    axis = BinAxis(CLOCK_PERIOD_S / 50, 50, 0.0, CLOCK_PERIOD_S)
-    corrected, plain = StampHistogram(axis, board), StampHistogram(axis, BoardCalibration.ideal())
-    corrected.add(records)
-    plain.add(records)
-    mean = photons / 50
-    assert np.std(plain.counts[:, 40]) > 0.2 * mean
-    # Poisson noise is sqrt(8000) = 89; sharing out makes neighbours alike and never noisier. 1.3:
-    # 50 bins' own scatter.
-    assert np.std(corrected.counts[:, 40]) < 1.3 * np.sqrt(mean)
-    assert corrected.counts[:, 40].sum() == pytest.approx(photons, rel=1e-6)
-
-
 def tags(rows):
     return np.array(rows, RECORD_DTYPE)
 

@@ -341,14 +341,6 @@ def test_pictures_come_in_order_and_bit_for_bit(camera):
     assert_allclose(known.array("row_times", float, 1, "s"), LIGHT.row_times, rtol=1e-7)
 
 
-def test_pictures_that_fell_out_of_the_ring_are_accounted_for(camera):
-    with opened(camera(Fault(4, "lost", 7))) as source:
-        gaps = read_gaps(source, 20)
-        finish(source)
-    assert source.stats.lost_device >= 7
-    assert any(gaps)
-
-
 @pytest.mark.parametrize(
     "unlike",
     [

@@ -2,8 +2,6 @@
 the dark ones out does to the returns.
 """
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -39,11 +37,10 @@ def inverse():
 
 @pytest.fixture(scope="module")
 def find_bins(inverse):
-    """What is looked at of some measurements, by a search with a limit, in successive blocks."""
+    """What is looked at of some measurements, by a search with a limit."""
 
-    def find(measurements, limit=5.0, cuts=(0, ROWS)):
-        blocks = [RowBlock(slice(*ends), inverse) for ends in pairwise(cuts)]
-        finder = SignalRowFinder(blocks, 3.0, limit, REACH)
+    def find(measurements, limit=5.0):
+        finder = SignalRowFinder([RowBlock(slice(0, ROWS), inverse)], 3.0, limit, REACH)
         return finder.bins(measurements)
 
     return find
@@ -111,13 +108,6 @@ def test_columns_and_rows_that_were_never_measured_are_not_taken_for_the_darkest
     bins = find_bins(with_pixel(measurements, (16, 16), 300.0, 40.0))
     assert bins.search_mask.sum() < 60
     assert 300 in bins.numbers[bins.search_mask]
-
-
-def test_blocks_with_an_operator_of_their_own_have_their_own_instants(find_bins):
-    lit = with_pixel(dark(4), (10, 20), 150.0, 20.0)
-    bins = find_bins(lit, cuts=[0, 7, 150, 151, 400, ROWS])
-    assert 150 in bins.numbers[bins.search_mask]
-    assert bins.bin_weights.sum() == pytest.approx(ROWS)
 
 
 def see_plates(seed, **settings):

@@ -100,15 +100,6 @@ def test_a_shot_of_any_brightness_gives_the_same_pictures(method):
     )
 
 
-def test_without_a_weight_it_solves_nonnegative_least_squares():
-    operator, random = projection(), np.random.default_rng(1)
-    truth = np.maximum(random.standard_normal((12, 11)), 0)
-    measurements = operator(truth) + 0.1 * random.standard_normal(40)
-    _, expected = scipy.optimize.nnls(operator.matrix.toarray(), measurements)
-    solver = solve(measurements, NonnegativeSparsity(0), 4000)
-    assert np.sqrt(2 * solver.objective[0]) == pytest.approx(expected, rel=1e-6)
-
-
 def test_optimality_of_sparse_solutions():
     """At the minimum A'(f - A h) = weight where h > 0 and <= weight elsewhere."""
     operator, weight = projection(), 0.02
