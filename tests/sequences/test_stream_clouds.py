@@ -95,19 +95,6 @@ def test_measurements_are_averaged_as_far_as_nothing_changes():
     assert np.mean(off[moved > 10] ** 2) == pytest.approx(np.mean(photons[moved > 10]), rel=0.3)
 
 
-def test_a_ranger_of_ones_own_is_used():
-    made = shots(2)
-    pipeline = RangingPipeline(made[0].camera, made[0].times)
-    (first, second) = stream_clouds(iter(made), pipeline, queue_size=2)
-    np.testing.assert_array_equal(first.cloud.xyz, next(stream_clouds(made, pipeline)).cloud.xyz)
-    assert second.shot == 1
-    assert second.taken is made[1]
-    # the same rows, whether they were rectified beforehand or are now
-    alone = pipeline.find_returns(pipeline.rectifier.rectify(made[1].counts))
-    assert len(alone) == len(second.returns)
-    np.testing.assert_allclose(alone.range, second.returns.range, atol=1e-6)
-
-
 def test_a_prior_begins_at_the_last_shot_and_leaves_rays_out():
     made = shots(1) * 3
     inverse = RangingPipeline(made[0].camera, made[0].times)

@@ -99,13 +99,6 @@ def test_unusable_streaks_are_refused(changes, fault, problem):
         Streak(**({"counts": COUNTS} | changes))
 
 
-def test_negative_readings_are_kept():
-    """A background taken off leaves noise on both sides of zero; clipping it would bias the
-    picture.
-    """
-    np.testing.assert_array_equal(Streak(COUNTS - 5).counts, COUNTS - 5)
-
-
 def test_the_time_axis_is_asked_for_by_name():
     streak = Streak(COUNTS, source="shot.tif")
     with pytest.raises(

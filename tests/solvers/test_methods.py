@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.metrics import nmse
 from tofclip.operators import Identity, LineProjection, RadonProjection
@@ -28,7 +27,7 @@ from tofclip.solvers import (
     relative_residual,
 )
 from tofclip.solvers.data_terms import estimate_robust_deviation
-from tofclip.solvers.direct import InverseTraces, order_by_patch
+from tofclip.solvers.direct import InverseTraces
 from tofclip.solvers.fista import (
     FOLD_COUNT,
     MAX_WEIGHT_WORK,
@@ -201,11 +200,6 @@ def test_linear_inverse_leaves_out_what_is_dead_in_every_frame_only(operator):
     assert not np.allclose(found, whole)
 
 
-def test_a_prepared_inverse_serves_many_shots(operator):
-    found = LinearInverse().prepare(operator).recover(readings(40)).frames
-    np.testing.assert_array_equal(found, LinearInverse().recover(operator, readings(40)).frames)
-
-
 def test_adjoint_is_the_adjoint_at_the_scale_that_fits_best(operator):
     measurements = readings(37)
     expected = np.moveaxis(operator.adjoint(measurements), -1, 0)
@@ -262,26 +256,6 @@ def test_a_lone_picture_is_recovered_as_in_a_block(method):
     alone = method.recover(operator, measurements).frames[0]
     many = method.recover(operator, np.tile(measurements, 3)).frames
     np.testing.assert_allclose(alone, many[1], atol=1e-3 * alone.max())
-
-
-@pytest.fixture(scope="module")
-def prepared():
-    camera = Camera([30.0, 85.0, 140.0], np.radians([-40.0, 5.0, 35.0]), (21, 37), 170)
-    return LinearInverse().prepare(camera.operator())
-
-
-@pytest.mark.parametrize("frames", [1, 31, 64, 150, 300])
-def test_traces_are_the_pictures_seen_pixel_by_pixel(prepared, frames):
-    measurements = readings(frames, frames, 170).astype(np.float32)
-    pixels = order_by_patch((21, 37))
-    traces, weights = InverseTraces(prepared, pixels), prepared.weights(measurements)
-    found = np.full((pixels.size, frames + 2), -1.0, np.float32)
-    for piece in (slice(0, 100), slice(100, 101), slice(101, pixels.size)):
-        traces.fill(weights, piece, found[piece], slice(1, frames + 1))
-    expected = prepared.recover(measurements).frames.reshape(frames, -1)[:, pixels].T
-    # the same sums in the same order: only a lone frame goes another way
-    np.testing.assert_allclose(found[:, 1:-1], expected, atol=1e-5 * np.abs(expected).max())
-    assert np.all(found[:, [0, -1]] == -1)
 
 
 @given(count=st.integers(2, 3000), run=st.integers(1, 200), seed=st.integers(0, 9))
