@@ -73,8 +73,8 @@ class Target:
     """Something that takes bytes from outside, with a few inputs that it likes.
 
     `slowness`: so many times fewer inputs are tried in a sample. `room`: bytes that decoding may take whatever
-    the input. `notices_all`: no damage at all is let through, as every byte has a checksum. `is_file`: what is
-    hardly the beginning of one, or something else behind it, is refused.
+    the input. `notices_all`: every byte has a checksum, so that all may be refused. `is_file`: what is hardly the
+    beginning of one, or something else behind it, is refused.
     """
 
     decode: Decode
