@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from array_places import DEVICE_NAMES, find_device
+from array_places import DEVICE_NAMES, FETCHED, find_device
 from numpy.testing import assert_allclose
 from scenes import (
     HIDDEN,
@@ -303,59 +303,26 @@ def test_other_steps_of_compiled_loops_refuse_too():
             attempt()
 
 
-class StrictDevice:
-    """A device of array-api-strict that mixes with no other, and gives NumPy nothing."""
-
-    def __init__(self):
-        self.library = pytest.importorskip("array_api_strict")
-        self.device = ComputeDevice("array_api_strict", self.library.Device("device1"))
-
-    def fetch(self, array):
-        return np.asarray(array.to_device(self.library.Device("CPU_DEVICE")))
-
-
-@pytest.fixture
-def elsewhere():
-    return StrictDevice()
-
-
-SMALL = Grid(np.arange(-0.3, 0.3, 0.1), np.arange(-0.2, 0.3, 0.1), [0.5, 0.6, 0.75])
-
-
 @pytest.mark.parametrize(
-    ("method", "laser", "faster", "agreement"),
+    "case",
     [
-        (PlanarRSD(0.2), "single", None, 2e-5),
-        (PlanarRSD(0.2), "confocal", None, 2e-5),
-        (Backprojection(0.2, weighting=Weighting(1, 1)), "single", None, 2e-5),
-        (Hybrid(0.3), "single", True, 5e-5),
-        (Hybrid(0.3), "single", False, 5e-5),
+        "rsd, masked",
+        "rsd, one row",
+        f"{Weighting(1.0, 1.0)}",
+        "hybrid, transforms, wavy",
+        "hybrid, direct, 1",
     ],
+    indirect=True,
 )
-def test_fields_stay_on_their_device(
-    method,
-    laser,
-    faster,
-    agreement,
-    elsewhere,
-    monkeypatch,
-):
-    sizes = []
-
-    def fetch(array):
-        sizes.append(array.size)
-        return elsewhere.fetch(array)
-
-    monkeypatch.setattr(nlos.phasor.propagate, "to_numpy", fetch)
-    monkeypatch.setattr(wall_to_plane, "is_faster_than_direct", lambda *_: faster)
-    wall = planar_wall(9, 11) if faster is None else curved_wall(9, 11)
-    capture = mask(see([HIDDEN], wall, laser), (2, 3))
-    found = method.phasor_field(capture.on(elsewhere.device), SMALL).values
-    expected = method.phasor_field(capture, SMALL).values
-    assert relative_error(elsewhere.fetch(found), expected) < agreement
+def test_fields_stay_on_their_device(case):
+    FETCHED.clear()
+    moved = case.capture.on(find_device("array_api_strict"))
+    found, fetched = case.method.phasor_field(moved, case.grid).values, [*FETCHED]
+    expected = case.method.phasor_field(case.capture, case.grid).values
+    assert relative_error(to_numpy(found), expected) < case.agreement
     # On purpose only the sample of phasors that terms are chosen by is fetched.
-    assert len(sizes) == (faster is not None)
-    assert all(size < 1024 * 100 for size in sizes)
+    assert len(fetched) == (case.faster is not None)
+    assert all(size < 1024 * 100 for size in fetched)
 
 
 @pytest.mark.parametrize("method", [RSD, HYBRID, BACKPROJECTION])
