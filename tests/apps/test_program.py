@@ -100,12 +100,6 @@ sys.exit(cli.main(sys.argv[1:]))
         assert "RuntimeWarning: invalid value" in whole.stderr
         assert "read of 5 bytes" in whole.stderr
 
-    def test_statuses_of_the_process(self, files):
-        good = start([*PROGRAM, "info", files / "camera.h5", "--json"])
-        bad = start([*PROGRAM, "info", files / "absent.h5"])
-        assert (good.returncode, good.stderr, json.loads(good.stdout)["kind"]) == (0, "", "camera")
-        assert (bad.returncode, bad.stdout, bad.stderr.count("\n")) == (2, "", 1)
-
     def test_debug_shows_where_an_error_came_from(self, shell):
         plain, traced = shell.refuses("info absent"), shell("info absent --debug")
         assert traced.status == 2

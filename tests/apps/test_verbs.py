@@ -7,7 +7,7 @@ import pytest
 import tifffile
 from small_instrument import ANGLES, BIN_WIDTH, CENTRES_PX, ROWS, SQUARE_ROWS
 
-from nlos import Capture, Volume
+from nlos import Volume
 from tofclip import Camera, Frames, PointCloud, Streak, recover
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -145,26 +145,6 @@ class TestConvertAndNlos:
         assert stored.find_brightest() == pytest.approx([found["peak_m"][axis] for axis in "xyz"])
         assert Path("mip.png").read_bytes().startswith(PNG)
         assert stored.provenance["settings"]["verb"] == "nlos reconstruct"
-
-    def test_a_capture_is_taken_as_it_is(self, shell):
-        x, y = np.meshgrid(np.linspace(-0.3, 0.3, 48), np.linspace(-0.3, 0.3, 48))
-        # spaced by less than half the pulse's shortest wave: no grating lobes
-        wall = np.stack([x, y, 0 * x], axis=-1)
-        hidden = np.array([0.1, -0.05, 0.3])
-        path = np.linalg.norm(hidden) + np.linalg.norm(wall - hidden, axis=-1)
-        bins = np.arange(200)[:, np.newaxis, np.newaxis]
-        signal = np.exp(-(((bins - path / (SPEED_OF_LIGHT * 10e-12)) / 2) ** 2) / 2)
-        Capture(signal, wall, np.zeros(3), 10e-12).save("capture.h5")
-        line = "nlos reconstruct capture.h5 --out volume.h5 --everywhere"
-        line += " --voxel-mm 20 --wavelength-mm 60 --overwrite"
-        found = shell.figures(line)
-        # Within a voxel across; along z the pulse of three cycles is 18 cm of path long, peaked
-        # within a voxel.
-        assert [found["peak_m"][axis] for axis in "xyz"] == pytest.approx(hidden, abs=0.025)
-        for method in ("rsd", "hybrid"):
-            again = shell.figures(f"{line} --method {method}")
-            assert (again["method"], again["peak_m"]) == (method, found["peak_m"])
-        shell.refuses(f"{line} --method lct", "confocal")
 
 
 class TestInfo:
