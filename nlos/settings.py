@@ -138,7 +138,10 @@ class Settings:
     )
     signal_to_noise: float | None = declare_setting("1", "Of the Wiener filter: lct.", shown="0.8")
     method: str | None = declare_setting(
-        "", "How the hidden scene is imaged.", shown="the quickest"
+        "",
+        f"One of {', '.join(METHODS.own)}.",
+        shown="the quickest that suits the capture",
+        choices=METHODS,
     )
     set: list[str] | None = declare_setting(  # noqa: RUF009 - declares a field
         "",

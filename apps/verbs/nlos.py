@@ -92,12 +92,6 @@ app = make_group("Image the scene hidden around a corner.")
 class ReconstructSettings(Settings):
     """How a capture is imaged, refined and written."""
 
-    method: str | None = declare_setting(
-        "",
-        f"One of {', '.join(METHODS.own)}.",
-        shown="the quickest that suits the capture",
-        choices=METHODS,
-    )
     point_fraction: float = declare_setting(
         "",
         "Voxels with this share of the brightest become points of .ply, .pcd, .csv, and the surface.",

@@ -77,12 +77,6 @@ virtual pulse.
 class StreamSettings(Settings):
     """How every capture of a stream is imaged."""
 
-    method: str | None = declare_setting(
-        "",
-        f"One of {', '.join(METHODS.own)}.",
-        shown="the quickest that suits the first capture",
-        choices=METHODS,
-    )
     average: int = declare_setting(
         "",
         "Captures averaged at the last depth, fewer nearer by: rsd, hybrid, backprojection.",
