@@ -72,15 +72,6 @@ def write_ply(
         file.write(rows.tobytes())
 
 
-def extract_surface(volume: Volume, fraction: float) -> Mesh:
-    """Draw the surface of `Volume.surface` by marching cubes."""
-    magnitude = volume.magnitude
-    require_surface(magnitude, fraction, 2)
-    found = volume.to_pyvista().contour([fraction * float(magnitude.max())])
-    faces = np.asarray(found.regular_faces, np.int32).reshape(-1, 3)
-    return Mesh(np.asarray(found.points, np.float32), faces)
-
-
 def require_surface(magnitude: AnyArray, fraction: float, voxels: int) -> None:
     """Refuse volumes that hold no surface or less than some `voxels` along an axis, and no fraction."""
     require(
@@ -91,20 +82,13 @@ def require_surface(magnitude: AnyArray, fraction: float, voxels: int) -> None:
     require(lit, f"a surface needs at least {voxels} voxels along every axis, and light")
 
 
-def extract_points(volume: Volume, fraction: float) -> tuple[Float32Array, Float32Array]:
-    """Positions and magnitudes of bright voxels; see `Volume.points`."""
-    z, y, x = np.nonzero(volume.threshold(fraction).magnitude)
-    xyz = np.stack([volume.grid.x[x], volume.grid.y[y], volume.grid.z[z]], axis=-1)
-    return xyz.astype(np.float32), volume.magnitude[z, y, x].astype(np.float32)
-
-
 def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
     """Write a volume for other programs; see `Volume.export`."""
     suffix = Path(path).suffix.lower()
     if suffix in POINT_SUFFIXES:
         from tofclip.lidar.export import Column, write_table
 
-        xyz, brightness = extract_points(volume, fraction)
+        xyz, brightness = volume.points(fraction)
         x, y, z = (Column(n, "m", np.ascontiguousarray(xyz[:, i])) for i, n in enumerate("xyz"))
         write_table(path, [x, y, z, Column("brightness", "", brightness)])
         return

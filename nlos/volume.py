@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nlos.export import Mesh, export_volume, require_surface
 from tofclip.arrays import (
     AnyArray,
     Array,
@@ -25,7 +26,6 @@ from tofclip.storage import Storable, stored_array, stored_mapping, stored_part
 
 if TYPE_CHECKING:
     from nlos.capture import Capture
-    from nlos.export import Mesh
 
 
 # Deeper than this a wall is too narrow an aperture to resolve much.
@@ -199,13 +199,8 @@ AXES = ("z", "y", "x")
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """The brightest voxel along every line of sight in z.
-
-    Parameters
-    ----------
-    brightness : (y, x) float array
-    depth : (y, x) float array
-        z of that voxel, m.
+    """Pictures (y, x) of a volume from the wall: the `brightness` of the brightest voxel along z, and
+    its `depth`, z in m.
     """
 
     brightness: AnyArray
@@ -312,15 +307,17 @@ class Volume(Storable):
 
     def surface(self, fraction: float = 0.3) -> Mesh:
         """Draw the surface on which the magnitude is ``fraction`` (0..1) of the largest."""
-        from nlos.export import extract_surface
-
-        return extract_surface(self, fraction)
+        magnitude = self.magnitude
+        require_surface(magnitude, fraction, 2)
+        found = self.to_pyvista().contour([fraction * float(magnitude.max())])  # marching cubes
+        faces = np.asarray(found.regular_faces, np.int32).reshape(-1, 3)
+        return Mesh(np.asarray(found.points, np.float32), faces)
 
     def points(self, fraction: float = 0.3) -> tuple[Float32Array, Float32Array]:
         """Positions (n, 3), m, and magnitudes (n,) of voxels from ``fraction`` (0..1) on."""
-        from nlos.export import extract_points
-
-        return extract_points(self, fraction)
+        z, y, x = np.nonzero(self.threshold(fraction).magnitude)
+        xyz = np.stack([self.grid.x[x], self.grid.y[y], self.grid.z[z]], axis=-1)
+        return xyz.astype(np.float32), self.magnitude[z, y, x].astype(np.float32)
 
     def export(self, path: str | Path, fraction: float = 0.3) -> None:
         """Write the magnitude for other programs, in the format that the suffix names, whole or not
@@ -336,8 +333,6 @@ class Volume(Storable):
         fraction : float
             Which voxels become points: those with at least this fraction of the brightest.
         """
-        from nlos.export import export_volume
-
         export_volume(self, path, fraction)
 
     def save_picture(self, path: str | Path) -> None:
