@@ -57,20 +57,16 @@ class DepthAverage:
         require(captures >= 1, f"an average is over 1 capture or more, got {captures}")
         depth = np.maximum(grid.z - wall, 0)
         farthest = max(float(depth[-1]), np.finfo(float).tiny)
-        self._windows = np.maximum(np.rint(captures * depth / farthest), 1).astype(int)
+        most = np.maximum(np.rint(captures * depth / farthest), 1)
+        self.windows: NDArray[np.int_] = most.astype(int)  # (z,), captures averaged at most
         self._earlier: deque[Array] = deque(maxlen=captures - 1)  # the latest first
-
-    @property
-    def windows(self) -> NDArray[np.int_]:
-        """Captures that are averaged at most at every depth, (z,)."""
-        return self._windows
 
     def add(self, field: Volume) -> Volume:
         """Take a new capture's complex field; return the average's brightness, float32."""
         newest = field.values
         total, count = newest.copy(), np.ones(newest.shape, np.float32)
         for number, earlier in enumerate(self._earlier, 1):
-            far = slice(int(np.searchsorted(self._windows, number, "right")), None)
+            far = slice(int(np.searchsorted(self.windows, number, "right")), None)
             changes = np.abs(newest[far] - earlier[far]) ** 2
             # every other voxel is enough
             quiet = np.quantile(changes[:, ::2, ::2], QUIET_SHARE, axis=(1, 2), keepdims=True)

@@ -256,7 +256,6 @@ def _read_points(fields: NamedArrays, name: str, pairs: int) -> FloatArray:
 
 LIGHT_CONE_BIN_WIDTH_S = 4e-12
 MIGRATION_BIN_WIDTH_S = 32e-12
-# m
 MIGRATION_WALL_WIDTH_M = 2.0
 
 
@@ -268,9 +267,9 @@ def read_light_cone_data(fields: NamedArrays) -> Capture:
 
     O'Toole, Lindell, Wetzstein, Nature 555, 338 (2018).
     """
-    counts = fields.read_time_last("rect_data")
-    wall = np.swapaxes(_build_wall(counts.shape[1], counts.shape[0], fields.number("width")), 0, 1)
-    wall = wall[::-1]
+    counts, half = fields.read_time_last("rect_data"), fields.number("width")
+    x, y = (np.linspace(-half, half, n) for n in counts.shape[:2])
+    wall = np.swapaxes(_build_wall(x, y), 0, 1)[::-1]
     return Capture(np.moveaxis(counts, 2, 0), wall, wall, LIGHT_CONE_BIN_WIDTH_S)
 
 
@@ -299,15 +298,14 @@ def read_migration_data(fields: NamedArrays) -> Capture:
         np.moveaxis(counts, 2, 0).reshape(counts.shape[2], -1), dtype=np.float32
     )
     signal = shift_signals(by_bin, delay_bins.ravel()).reshape(counts.shape[2], *counts.shape[:2])
-    wall = _build_wall(counts.shape[0], counts.shape[1], MIGRATION_WALL_WIDTH_M / 2)
+    half = MIGRATION_WALL_WIDTH_M / 2
+    y, x = (np.linspace(-half, half, n) for n in counts.shape[:2])
+    wall = _build_wall(x, y)
     return Capture(signal, wall, wall, MIGRATION_BIN_WIDTH_S)
 
 
-def _build_wall(rows: int, columns: int, half_width: float) -> FloatArray:
-    x, y = np.meshgrid(
-        np.linspace(-half_width, half_width, columns), np.linspace(-half_width, half_width, rows)
-    )
-    return np.stack([x, y, np.zeros_like(x)], axis=-1)
+def _build_wall(x: FloatArray, y: FloatArray) -> FloatArray:
+    return np.stack([*np.meshgrid(x, y), np.zeros((y.size, x.size))], axis=-1)
 
 
 def read_tal(fields: NamedArrays) -> Capture:
@@ -503,7 +501,7 @@ def read_rectified_data(fields: NamedArrays) -> Capture:
     rows, columns, _ = counts.shape
     spacing = fields.number("sampling_spacing")
     x, y = ((np.arange(n) - n / 2) * spacing for n in (columns, rows))
-    wall = np.stack([*np.meshgrid(x, y), np.zeros((rows, columns))], axis=-1)
+    wall = _build_wall(x, y)
     column, row = fields.finite_array("SPAD_index", 2).astype(int)
     if not (0 <= column < columns and 0 <= row < rows):
         raise fields.fault(
