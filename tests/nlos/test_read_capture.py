@@ -17,6 +17,7 @@ from nlos.capture import TimeAxis
 from nlos.io import read_capture
 from nlos.io.labs import rotate_to_scene
 from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.io.light_fields import write_exr_parts
 from tofclip.storage import Record
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -404,23 +405,12 @@ laser_m = [0.12, 0.05, 0.0]
 """
 
 
-def write_exr(path, channels):
-    import OpenEXR
-
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(
-        header, {name: np.ascontiguousarray(v, np.float32) for name, v in channels.items()}
-    ).write(str(path))
-
-
 def write_streaks(folder, capture, geometry=GEOMETRY):
     for row in range(capture.signal.shape[1]):
         brightness = capture.signal[:, row].T  # (column, t)
         # No leading zeros, as renderers number them: 10 comes after 9.
-        write_exr(
-            folder / f"streak_{row}.exr",
-            {"R": 0.5 * brightness, "G": brightness, "B": 1.5 * brightness},
-        )
+        colours = {"R": 0.5 * brightness, "G": brightness, "B": 1.5 * brightness}
+        write_exr_parts({"": colours}, folder / f"streak_{row}.exr")
     (folder / "geometry.toml").write_text(geometry)
 
 
@@ -457,9 +447,9 @@ def test_exr_folders_that_are_no_capture(tmp_path):
     (tmp_path / "geometry.toml").unlink()
     refused(tmp_path, r"no geometry\.toml")
     (tmp_path / "geometry.toml").write_text(GEOMETRY)
-    write_exr(tmp_path / "streak_1.exr", {"Y": np.ones((4, 5))})
+    write_exr_parts({"": {"Y": np.ones((4, 5))}}, tmp_path / "streak_1.exr")
     refused(tmp_path, r"streak_1\.exr: is \(4, 5\) pixels")
-    write_exr(tmp_path / "streak_1.exr", {"Z": np.ones((4, 5))})
+    write_exr_parts({"": {"Z": np.ones((4, 5))}}, tmp_path / "streak_1.exr")
     refused(tmp_path, "none of which is R, G, B or Y")
     whole = (tmp_path / "streak_0.exr").read_bytes()
     (tmp_path / "streak_1.exr").write_bytes(whole[: len(whole) // 2])
