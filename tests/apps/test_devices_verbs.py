@@ -1,6 +1,5 @@
 """tofclip devices and tofclip record, on emulated instruments."""
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -82,17 +81,6 @@ def test_damage_is_named_and_repaired(shell, recording):
     assert shell.figures("devices verify run.h5", status=2, said=said)["damaged_blocks"] == 1
     assert "wrote sound.h5" in shell("devices repair run.h5 --out sound.h5").out
     assert shell("devices verify sound.h5").status == 0
-
-
-def test_a_recording_is_not_overwritten_unless_asked(shell, recording):
-    path = Path("run.h5")
-    shutil.copy(recording, path)
-    before = path.read_bytes()
-    line = f"record '{SIM}' --out run.h5 --seconds 0.1"
-    shell.refuses(line, "--overwrite")
-    assert path.read_bytes() == before
-    assert shell(f"{line} --overwrite").status == 0
-    assert path.read_bytes() != before
 
 
 def test_what_was_recorded_is_recovered(shell, tmp_path):

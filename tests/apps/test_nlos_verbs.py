@@ -177,20 +177,14 @@ class TestReconstruct:
 
 class TestRefine:
     @pytest.mark.parametrize("prior", ["l1", "tv"])
-    def test_iterations_gather_the_light(self, shell, prior):
-        line = f"nlos reconstruct {{curved}} {BOX} --voxel-mm 20 --wavelength-mm 150 --out"
-        shell.figures(f"{line} one.h5 --method hybrid")
-        found = shell.figures(f"{line} two.h5 --refine {prior} --iterations 8")
+    def test_a_prior_and_its_iterations_are_reported(self, shell, prior):
+        """What they make of an image: see `tests/nlos/test_refinement.py`."""
+        words = f"{BOX} --voxel-mm 20 --wavelength-mm 150 --refine {prior} --iterations 8"
+        found = shell.figures(f"nlos reconstruct {{curved}} {words} --out volume.h5")
         assert (found["method"], found["refine"], found["iterations"]) == ("hybrid", prior, 8)
         assert found["stopped_because"] == "iterations done"
-        plain, refined = pair()
-        axes = np.meshgrid(plain.grid.z, plain.grid.y, plain.grid.x, indexing="ij")
-        near = np.linalg.norm(np.stack(axes[::-1], axis=-1) - HIDDEN_POINT, axis=-1) < 0.04
-        shares = [np.sum(one.values[near] ** 2) / np.sum(one.values**2) for one in (plain, refined)]
-        assert refined.values.min() >= 0
-        assert shares[1] > 1.5 * shares[0]
         assert peak(found) == pytest.approx(HIDDEN_POINT, abs=0.03)
-        reported = Path("two.toml").read_text()
+        reported = Path("volume.toml").read_text()
         assert f'refine = "{prior}"\niterations = 8\nprior_weight = 0.02\n' in reported
 
     def test_photons_gather_the_light(self, shell):
