@@ -77,16 +77,13 @@ def test_figures_of_merit_of_volumes_that_need_no_computing():
     assert compare_with_truth(coarse, truth)["truth_reach_m"] == pytest.approx(0.3)
 
 
-def test_the_point_lights_up_when_the_flash_reaches_it(shell, curved):
-    words = "--every-depth --voxel-mm 20 --instants 41 --out film.h5"
+def test_a_film_begins_before_the_flash_arrives_and_ends_after_it_left(shell, curved):
+    """What it shows: see `tests/nlos/test_transient_video.py`."""
+    words = "--every-depth --voxel-mm 40 --instants 5 --out film.h5"
     found = shell.figures(f"nlos film {{curved}} {words}")
     video = TransientVideo.load("film.h5")
-    assert video.values.shape == (41, *found["voxels"])
+    assert video.values.shape == (5, *found["voxels"])
     arrival = np.linalg.norm(Capture.load(curved).laser - HIDDEN_POINT) / SPEED_OF_LIGHT
-    lit = video.times[video.values[:, *video.grid.find_nearest(HIDDEN_POINT)].argmax()]
-    # A tenth of a nanosecond is the distance to the voxel's middle and half the step of time.
-    assert lit == pytest.approx(arrival, abs=0.1e-9)
-    # By default it begins before the flash arrives, and ends after it left.
     assert found["first_ns"] < arrival / 1e-9 < found["last_ns"]
     assert video.provenance["settings"]["verb"] == "nlos film"
 
