@@ -55,15 +55,14 @@ def ball(surface, tmp_path_factory):
     return path
 
 
-def test_a_range_image_with_deviations(shell, surface):
+def test_a_range_image_with_deviations(shell):
+    """How true they are: see `tests/lidar/test_photon_truth.py`."""
     figures = shell.figures(f"lidar photons {{ball}} --out range.npz {PULSE}")
     assert (figures["pixels"], figures["coverage"], figures["returns"]) == (2240, 1.0, 2240)
     assert figures["settings"]["axes"].startswith("yxt, ahead of the next axis by a factor of ")
     written = load()
     assert set(written) == FIELDS
     assert all(values.shape == (40, 56) for values in written.values())
-    assert np.mean(np.abs(written["range_m"] / BIN_M - surface) < 3) > 0.97
-    assert np.median(written["range_sigma_m"]) < BIN_M
 
 
 def test_clouds_pictures_and_single_pixels(shell, surface):
@@ -74,14 +73,11 @@ def test_clouds_pictures_and_single_pixels(shell, surface):
     # The pixel in the middle looks straight ahead.
     assert np.min(np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1])) < 1e-3
     assert Path("picture.png").stat().st_size > 1000
-    shell.figures(f"lidar photons {{ball}} --out range.npz {PULSE} --single-pixel")
-    found = load()["range_m"] / BIN_M
-    seen = np.isfinite(found)
-    assert 0.3 < seen.mean() < 1
-    assert np.mean(np.abs(found - surface)[seen] < 5) > 0.95
+    alone = shell.figures(f"lidar photons {{ball}} --out range.npz {PULSE} --single-pixel")
+    assert 0.3 < alone["coverage"] == np.isfinite(load()["range_m"]).mean() < 1
 
 
-def test_a_hot_pixel_is_counted_and_changes_nothing(shell, ball, surface):
+def test_a_hot_pixel_is_counted_and_left_out(shell, ball):
     cube = np.load(ball).astype(np.uint32)
     cube[30, 50, 20] += 1_000_000
     np.save("hot.npy", cube)
@@ -93,10 +89,8 @@ def test_a_hot_pixel_is_counted_and_changes_nothing(shell, ball, surface):
         assert settings["pulse_fwhm_ps"] == pytest.approx(2.3548 * 2.1 * 80, rel=0.15)
         written = load()
         np.testing.assert_array_equal(np.argwhere(written["hot_pixels"]), [[30, 50]])
-        found = written["range_m"] / BIN_M
-        seen = np.isfinite(found)
-        assert seen[30, 50] != bool(words)  # from its neighbours, where these have a say
-        assert np.mean(np.abs(found - surface)[seen] < 5) > 0.95
+        # from its neighbours, where these have a say
+        assert np.isfinite(written["range_m"][30, 50]) != bool(words)
 
 
 def assert_gates_show_the_scene(bound_m):
