@@ -114,10 +114,8 @@ class Capture(Storable):
     laser : (3,) or (..., 3) array
         The laser spot on the wall, m; or one spot per wall point, equal to the wall for a confocal
         scan.
-    bin_width : float
-        Duration of a time bin, s.
-    start : float
-        Length of the path laser spot -> hidden point -> wall point that bin 0 holds, m.
+    bin_width, start
+        As of `TimeAxis`.
     provenance : mapping
         How it came about.
 

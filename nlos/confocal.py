@@ -307,9 +307,7 @@ class FKMigration(Method):
     The spectrum is interpolated about the middle of the record, where linear interpolation dims
     late signals least.
 
-    Memory: for P wall points and T bins, two half spectra of the box padded to twice its size along
-    all three axes, some 100 * P * T bytes (0.2 GB for 64 x 64 x 512); time: two transforms of that
-    box.
+    Memory as of `LightCone`; time: two transforms of its padded box.
 
     Lindell, Wetzstein, O'Toole, "Wave-based non-line-of-sight imaging using fast f-k migration",
     ACM Trans. Graph. 38, 116 (2019), Eq. 7-9.
@@ -317,8 +315,7 @@ class FKMigration(Method):
     Parameters
     ----------
     falloff : float
-        Power of the distance with which brightness falls: 4 for diffuse things, 2 for
-        retroreflective ones.
+        As of `LightCone`.
     """
 
     falloff: float = 4.0

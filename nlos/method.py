@@ -151,8 +151,6 @@ class Method(ABC):
 
         Parameters
         ----------
-        capture : Capture
-        grid : Grid
         progress : callable, optional
             Called with a part of the plan's `cost` whenever so much is done.
 

@@ -145,10 +145,6 @@ class TransientImaging:
 
     Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572,
     620-623 (2019), transient camera; Liu, Bauer, Velten, Nat. Commun. 11, 1645 (2020).
-
-    Parameters
-    ----------
-    method : PlanarRSD or Hybrid
     """
 
     method: PlanarRSD | Hybrid
@@ -160,8 +156,6 @@ class TransientImaging:
 
         Parameters
         ----------
-        capture : Capture
-        grid : Grid
         times : (t,) array
             Seconds since the flash left its spot on the wall.
         progress : callable, optional

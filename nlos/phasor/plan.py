@@ -366,15 +366,11 @@ class Hybrid(WaveMethod):
 
     Parameters
     ----------
-    wavelength : float
-        Carrier wavelength of the virtual pulse, m of path.
-    cycles : float
-        Length of the pulse in wavelengths; see `nlos.band.VirtualPulse`.
+    wavelength, cycles, tolerance
+        As of `PlanarRSD`.
     propagation : {"spectral", "time"}
         From wall to plane; see `nlos.propagate`. "time" is the paper's, slow and as coarse as the
         time bins.
-    tolerance : float
-        Relative error of the image that is allowed for the sake of speed, 1e-4 to 0.1.
     plane_z : float, optional
         Where the virtual plane stands, m. Defaults to 5 to 10 cm in front of the foremost wall
         point.

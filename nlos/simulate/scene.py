@@ -375,10 +375,6 @@ class HiddenScene:
 
     Costs one evaluation per facet and wall point, and a test of every triangle in each; memory for
     the signals and 64 wall points on fine bins.
-
-    Parameters
-    ----------
-    surfaces : sequence of Surface
     """
 
     surfaces: Sequence[Surface]
