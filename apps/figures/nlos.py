@@ -23,7 +23,6 @@ from apps.figures.style import (
     make_figure,
     outer_edges,
 )
-from apps.verbs.nlos_imaging import WAVELENGTH_M, MeasuredVolume
 from nlos import Capture, Volume
 from nlos.known_scenes import HiddenTruth
 from tofclip.notebook import letter_panels
@@ -125,9 +124,7 @@ PANEL_ASPECT = 0.63  # of the panels that hold no image, relative to their width
 LIT_THRESHOLD = 0.02
 
 
-def make_demo_figure(
-    capture: Capture, truth: HiddenTruth, images: Mapping[str, MeasuredVolume]
-) -> Figure:
+def make_demo_figure(capture: Capture, truth: HiddenTruth, images: Mapping[str, Volume]) -> Figure:
     """Draw the room from above, one row's streak, and the images by all methods; ``flat`` is that for
     a wall without its depth.
     """
@@ -136,14 +133,14 @@ def make_demo_figure(
     _draw_room(panels[0, 0], capture, truth)
     _draw_streak(panels[0, 1], capture)
     hybrid, slow, flat = (images[name] for name in ("hybrid", "backprojection", "flat"))
-    wavelength = f"{1e3 * WAVELENGTH_M:.0f} mm"
+    wavelength = f"{1e3 * hybrid.provenance['imaging']['wavelength_m']:.0f} mm"
     for axes, image, plane, title in (
         (panels[0, 2], flat, "xy", "hybrid, had the wall been taken for flat"),
         (panels[1, 0], hybrid, "xy", f"hybrid, wavelength {wavelength}"),
         (panels[1, 1], slow, "xy", f"back-projection, wavelength {wavelength}"),
         (panels[1, 2], hybrid, "xz", "hybrid, seen from above"),
     ):
-        drawn = draw_view(axes, image.volume, plane, truth)
+        drawn = draw_view(axes, image, plane, truth)
         down = "y, down (m)" if plane == "xy" else "z, away from the wall (m)"
         label_axes(axes, title, "x (m)", down)
         axes.plot([], [], color=LINE_COLOUR, label="truth")

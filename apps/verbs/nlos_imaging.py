@@ -408,10 +408,11 @@ def demo(
         "backprojection": measure_imaging("backprojection", slow, capture, grid),
         "flat": measure_imaging("as if flat", hybrid, flat, grid),
     }
+    volumes = {name: image.volume for name, image in images.items()}
     truth.attach_to_record(capture).save(written[0])
     for path in written[1:]:
-        images[path.stem].volume.save(path)
-    save_figure(make_demo_figure(capture, truth, images), picture)
+        volumes[path.stem].save(path)
+    save_figure(make_demo_figure(capture, truth, volumes), picture)
     figures = {
         "seed": seed,
         "wall_points": len(capture.points),
@@ -420,7 +421,7 @@ def demo(
             name: {
                 "seconds": image.seconds,
                 "peak_mib": image.peak_mib,
-                "correlation": correlate_views(image.volume, images["backprojection"].volume),
+                "correlation": correlate_views(image.volume, volumes["backprojection"]),
                 **compare_with_truth(image.volume, truth),
             }
             for name, image in images.items()
