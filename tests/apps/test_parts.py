@@ -7,7 +7,7 @@ import json
 import signal
 import threading
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +27,8 @@ from apps.report import (
     report,
     require_writable,
 )
-from apps.verbs.nlos import ReconstructSettings
-from apps.verbs.nlos_imaging import CompareSettings
 from nlos import simulate
-from nlos.settings import WALLS, SceneSettings, declare_setting
+from nlos.settings import WALLS, declare_setting
 from tofclip import Frames, Streak
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.notebook import save_figure
@@ -206,16 +204,19 @@ class Sample:
     count: int = declare_setting("", "A number.", 2)
     whole: bool = declare_setting("", "A choice.", False)
     ends: tuple[float, float] | None = declare_setting("m", "A pair.")
+    words: list[str] | None = declare_setting("", "Texts.")  # noqa: RUF009 - declares a field
 
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
 SAMPLES = st.builds(
     Sample,
-    name=st.none() | st.text(st.characters(exclude_categories=["Cs"])),
+    name=st.none() | TEXTS,
     length=st.none() | NUMBERS,
     count=st.integers(-(2**63), 2**63 - 1),
     whole=st.booleans(),
     ends=st.none() | st.tuples(NUMBERS, NUMBERS),
+    words=st.none() | st.lists(TEXTS),
 )
 
 
@@ -247,7 +248,7 @@ def test_lengths_in_mm_are_metres_inside_and_come_back_as_they_were(facet_mm):
     ("text", "complaint"),
     [
         ("lenght_m = 1", "did you mean 'length_m'"),
-        ("zzz = 1", "known are name, length_m, facet_mm, count, whole, ends_m"),
+        ("zzz = 1", "known are name, length_m, facet_mm, count, whole, ends_m, words"),
         ("length_m = 'one'", "length_m should be a valid number, got 'one'"),
         ("length_m = true", "length_m should be a valid number"),
         ("length_m = nan", "length_m should be a finite number"),
@@ -279,19 +280,3 @@ def test_files_that_are_no_toml(content, tmp_path):
 
 def test_walls_are_those_of_the_simulation():
     assert tuple(simulate.WALLS) == WALLS
-
-
-@pytest.mark.parametrize("kind", [ReconstructSettings, CompareSettings, SceneSettings])
-def test_every_setting_can_be_told_by_a_file(kind, tmp_path):
-    """Values of each field's own type go out and come back."""
-    examples = {"float": 0.5, "int": 3, "str": "a", "bool": True, "list[str]": ["cycles=3"]}
-    examples["tuple[float, float]"] = (0.5, 1.5)
-    values = {
-        field.name: examples[
-            str(field.type).removesuffix(" | None").replace("Limits", "tuple[float, float]")
-        ]
-        for field in fields(kind)
-        if "help" in field.metadata and field.name not in ("gate_found", "reasons")
-    }
-    save_settings(kind(**values), tmp_path / "all.toml", "all of them")
-    assert load_settings(kind, tmp_path / "all.toml", {}) == kind(**values)
