@@ -62,19 +62,6 @@ def test_lasers_follow_the_points():
     assert Capture(SIGNAL, WALL, [1, 2, 3], 1e-12).lasers.tolist() == [[1, 2, 3]]
 
 
-@pytest.mark.parametrize("start", [0.0, 0.2, -1.3])
-def test_the_first_bin_is_at_the_start_of_the_record(start):
-    axis = Capture(SIGNAL, WALL, [0, 0, 0], 1e-10, start).axis
-    assert axis.paths == pytest.approx(start + SPEED_OF_LIGHT * 1e-10 * np.arange(5))
-
-
-@pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float64, bool])
-def test_counts_of_any_type_become_float32(dtype):
-    capture = Capture(np.ones((5, 3, 4), dtype), WALL, WALL, 1e-12)
-    assert capture.signal.dtype == np.float32
-    assert np.all(capture.signal == 1)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

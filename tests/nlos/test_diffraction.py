@@ -14,9 +14,6 @@ from scenes import (
     JITTER,
     LONG,
     SHAPED,
-    SHAPED_JITTER,
-    SHAPED_POINTS,
-    SHAPED_SPOT,
     SPOTS,
     THREE_POINTS,
     UNEVEN_DEPTHS,
@@ -27,14 +24,12 @@ from scenes import (
     scaled_error,
     see,
     see_shaped,
-    shaped_wall,
 )
 
 import nlos.method
 import nlos.phasor.depth_steps
 import nlos.phasor.to_depths_compiled
 from nlos import Grid, Hybrid, PlanarRSD
-from nlos.capture import TimeAxis
 from nlos.phasor import fourier, wall_to_plane
 from nlos.plane import Plane
 from tofclip.errors import InputError
@@ -51,16 +46,6 @@ def scene(laser=SPOTS[0], wall=None):
 def truth(shape):
     capture = see_shaped(shape, 25)
     return capture, compute_exact_phasor_field(capture, SHAPED, HYBRID.pulse).values
-
-
-def test_propagation_in_time_shows_the_same_points():
-    wall = shaped_wall("relief", 11)
-    capture = see(SHAPED_POINTS[:1], wall, SHAPED_SPOT, TimeAxis(1024, 16e-12), SHAPED_JITTER)
-    grid = Grid(np.linspace(0.1, 0.5, 5), np.linspace(-0.4, 0.0, 5), [0.9, 1.0, 1.1])
-    in_time = replace(HYBRID, propagation="time").reconstruct(capture, grid)
-    assert in_time.find_brightest() == pytest.approx(tuple(SHAPED_POINTS[0]))
-    assert scaled_error(in_time.values, HYBRID.reconstruct(capture, grid).values) < 3e-2
-    assert in_time.provenance["imaging"]["propagation"] == "time"
 
 
 def test_the_plane_may_stand_elsewhere_and_before_it_voxels_stay_sensible():

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import scipy.io
 from numpy.linalg import norm
-from relay_frames import BIN_WIDTH, DELAY_BINS, frames_of, relay_wall, see_by_camera, wall_of
 from scenes import HIDDEN, around, planar_wall, see
 
 from nlos import Backprojection, Capture
@@ -66,14 +65,6 @@ def test_our_own_captures_keep_their_history(tmp_path):
     found = read_capture(tmp_path / "wall.h5")
     same(found, capture)
     assert found.provenance == {"shot": 7}
-
-
-def test_frames_with_a_wall_become_a_capture(tmp_path):
-    wall = wall_of(6, 7)
-    frames_of(see_by_camera(wall), {"relay_wall": relay_wall(wall)}).save(tmp_path / "frames.h5")
-    found = read_capture(tmp_path / "frames.h5")
-    assert found.signal.shape == (800, 6, 7)
-    assert found.start == pytest.approx(DELAY_BINS * BIN_WIDTH * SPEED_OF_LIGHT)
 
 
 @pytest.mark.parametrize("laser", [SPOT, WALL], ids=["single", "confocal"])

@@ -7,7 +7,6 @@ from scenes import (
     curved_wall,
     distance_to_nearest,
     energy_fraction,
-    find_refusal,
     planar_wall,
     relative_error,
     see,
@@ -18,7 +17,6 @@ from nlos.capture import TimeAxis
 from nlos.illumination import choose_unaliased_band
 from nlos.refinement.l1 import WallModel, build_total_variation
 from nlos.simulate import HiddenScene, Surface, add_poisson_noise
-from tofclip.errors import InputError
 from tofclip.solvers import Sparse
 
 HYBRID = Hybrid(0.2, 4.0)
@@ -129,18 +127,6 @@ def test_progress_counts_every_voxel_in_every_iteration():
     )
     assert sum(done) == 3 * small.size
     assert volume.provenance["imaging"]["stopped_because"] == "iterations done"
-
-
-def test_what_cannot_be_refined_is_refused():
-    capture, refinement = seen("single"), Refinement(HYBRID)
-    coarse = Grid(GRID.x, GRID.y, np.arange(0.5, 1.0, 0.06))
-    assert not find_refusal(refinement, capture, GRID)
-    for grid, reason in (
-        (coarse, "voxels 0.06 m apart in depth are too coarse"),
-        (Grid(GRID.x, GRID.y, GRID.z - 1), "behind the hindmost wall point"),
-    ):
-        with pytest.raises(InputError, match=reason):
-            refinement.reconstruct(capture, grid)
 
 
 @pytest.mark.nightly

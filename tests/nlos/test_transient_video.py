@@ -83,18 +83,6 @@ def test_long_after_the_record_nothing_echoes():
     assert late[1].max() < 2e-2 * late[0].max()
 
 
-def test_a_video_comes_back_from_its_file(tmp_path):
-    imaging, capture = TransientImaging(METHODS["rsd"]), seen("rsd")
-    for make in (imaging.video, imaging.front_views):
-        video = make(capture, GRID, ARRIVALS)
-        video.save(tmp_path / "video.h5")
-        loaded = TransientVideo.load(tmp_path / "video.h5")
-        assert np.array_equal(loaded.values, video.values)
-        assert np.array_equal(loaded.times, ARRIVALS)
-        assert np.array_equal(loaded.grid.z, GRID.z)
-        assert loaded.provenance["imaging"]["method"] == "transient imaging by PlanarRSD"
-
-
 def test_the_film_shows_the_point_where_it_is(tmp_path):
     values = np.zeros((3, *GRID.shape), np.float32)
     values[1, 2, 3, 12] = 1.0  # y -0.25, x 0.2
