@@ -36,18 +36,15 @@ def instrument(bins=150, photons=2e5):
     return Instrument(CAMERA, StreakDetector(bins, 100e-12, peak_photons=photons))
 
 
-def test_accuracy_is_near_its_bound_and_a_tail_costs_some(shell):
-    words = "--photons 100 --background 0.1 --pulse-ps 60 --bin-width-ps 20 --trials 200 --seed 0"
-    figures = shell.figures(f"lidar accuracy {words}")
-    # c/2 * 26.1 ps (pulse and bin) / root 100, and a little background
-    assert 3.9e-4 < figures["bound_m"] < 4.1e-4
-    assert 0.8 < figures["ratio"] < 1.2  # 200 trials: 5 percent
+def test_the_bound_of_accuracy_and_what_a_tail_costs(shell):
+    """How near to it returns are: see `tests/lidar/test_photon_limit.py`."""
     plain, tailed = (
         shell.figures(f"lidar accuracy --trials 1 {tail}")["bound_m"]
         for tail in ("", "--decay-ps 200")
     )
+    # c/2 * 26.1 ps (pulse and bin) / root 100, and a little background
+    assert 3.9e-4 < plain < 4.1e-4
     assert tailed > 1.5 * plain
-    assert "accuracy" in shell("lidar").out
 
 
 def test_parallax_makes_the_camera_that_depth_locked_recovery_needs(shell):
