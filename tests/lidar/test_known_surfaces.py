@@ -182,18 +182,28 @@ def test_a_pulse_is_as_short_as_the_shot_shows_it():
     assert score["median_mm"] < 0.5
 
 
+def test_a_table_in_little_light_is_found_as_far_as_it_reaches():
+    """Of one that is turned far frames in 200 photons show the near part: 0.27 of the returns were missed and
+    0.055 of the points false. Tables of five seeds have 0.002 to 0.010, and none.
+    """
+    shot = make_shot("table", seed=9, photons=200, size=64)
+    _, score = recover_shot(shot, shot.camera)
+    assert score["miss"] < 0.03
+    assert score["false"] < 0.005
+
+
 def test_a_steep_surface_that_ends_within_pixels_shows_neither_pulse_nor_place_wrong():
     """A table of which a pixel spans 27 mm was 6 to 16 mm off, two to four times what it said: its slope was
-    taken for the pulse, and the light of its borders for that of whole pixels. Seeds 0 to 2 are now 0.6 to
-    2.1 mm off.
+    taken for the pulse, and the light of its borders for that of whole pixels; its far edge was missed. Seeds 0
+    to 2 are now 0.5 to 1.6 mm off.
     """
     table = plate("table", (0, 0.3, 2.8), (2.4, 1.1), 0.5, 0.1, 0.8)
     wall = plate("wall", (0, 0, 4.2), (4, 4), 0.45, -0.15)
     shot = make_shot([table, wall], seed=1, size=48)
     _, score = recover_shot(shot, shot.true_camera)
-    assert score["miss"] < 0.05  # 0.02
+    assert score["miss"] < 0.01  # 0
     assert score["false"] < 0.005
-    assert score["medians_mm"]["table"] < 2.2
+    assert score["medians_mm"]["table"] < 1.6
     assert score["z"]["table"] < 2
 
 

@@ -322,6 +322,11 @@ class Refinement:
     # amplitudes that explain this shot best without the prior, if it is this shot's step
     free: Image | None
 
+    def cover(self, model: SurfaceModel) -> Refinement:
+        """Return what is known where the same camera sees other points."""
+        explained = np.zeros((ROUND_COEFFICIENTS, model.surface.size), np.float32)
+        return replace(self, explained=explained, free=None)
+
 
 def refine_state(
     model: SurfaceModel,

@@ -34,9 +34,9 @@ from tofclip.units import SPEED_OF_LIGHT
 
 SURE_FALSE_ALARM = 0.04  # of a return that makes a surface
 MIN_SURE_FRACTION = 0.8  # of a patch's returns
-# Of the signal, noise that hides surfaces from single pixels (0.2 to 0.7 in 50 photons, 0.1 in 200), and
-# the standard deviation of the mean over pixels that is then looked at.
-DARK, POOLED_PX = 0.15, 1.0
+# Of the signal, noise that hides surfaces from single pixels (0.05 to 0.1 in 200 photons, 0.2 to 0.7 in 50), and
+# the standard deviations of the mean over pixels that is then looked at.
+DIM, DARK, DIM_PX, DARK_PX = 0.05, 0.15, 0.7, 1.0
 
 # Of the returns' light: below, the shot is not one of surfaces. Simulated shots of surfaces have 0.93
 # or more, recorded ones 0.97; recorded relay walls have 0.50 to 0.79.
@@ -70,8 +70,9 @@ def find_surfaces(
 
     # 2. Patches.
     shown = _leave_out_doubtful(found, ray_length, bin_m)
-    if darkness > DARK:
-        shown = _add_pooled(shown, frames, ray_length, bin_m)
+    if darkness > DIM:
+        pooled_px = DARK_PX if darkness > DARK else DIM_PX
+        shown = _add_pooled(shown, frames, pooled_px, ray_length, bin_m)
     patches = find_brightest_patches(shown, ray_length, bin_m)
     on_surface = np.zeros(camera.image_shape, bool)
     for patch in patches:
@@ -89,11 +90,13 @@ def find_surfaces(
     return AmplitudeSolver(model, amplitude, weight)
 
 
-def _add_pooled(shown: Returns, frames: Frames, ray_length: FloatArray, bin_m: float) -> Returns:
+def _add_pooled(
+    shown: Returns, frames: Frames, sigma_px: float, ray_length: FloatArray, bin_m: float
+) -> Returns:
     """Add what pixels without a return show together with those about them: of a surface in little light
     none alone is out of the noise, but many beside each other are at one range.
     """
-    pooled = scipy.ndimage.gaussian_filter(frames.values, (0, POOLED_PX, POOLED_PX))
+    pooled = scipy.ndimage.gaussian_filter(frames.values, (0, sigma_px, sigma_px))
     pooled[:, shown.y, shown.x] = frames.values[:, shown.y, shown.x]
     found = depth(replace(frames, values=pooled), shown.camera)
     found = _leave_out_doubtful(found, ray_length, bin_m)
