@@ -63,8 +63,8 @@ AGAINST_DIM = 3.0  # until ranges are known; then amplitudes are as the shot has
 SPARSELY, FOLLOWING_SPARSELY = ((4.0, 80), (2.0, 20)), ((4.0, 50), (2.0, 10))
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
 LAST_STEP_SIGMAS = 0.15
-# After a longer one of its own a surface goes on alone, for as many steps.
-LONG_STEP_SIGMAS, SETTLING_STEPS = 0.7, 3
+# After a longer one of its own a surface goes on alone, for as many steps; more after the last one.
+LONG_STEP_SIGMAS, SETTLING_STEPS, LAST_SETTLING_STEPS = 0.7, 3, 8
 # Where the last shot's fit begins: before and after the ranges' step, and how far beyond the returns
 # of quick frames surfaces may reach.
 FOLLOWING_ITERATIONS, FOLLOWING_MARGIN_PX = 10, 4
@@ -530,8 +530,10 @@ def _refine(
                 break
             alone = far > LONG_STEP_SIGMAS**2 * points
             # where most of a scene moves, it may be the instrument that is not known yet
-            if number + 1 < most and 2 * points[alone].sum() < points.sum():
-                settle_surfaces(solver, alone, found)
+            if 2 * points[alone].sum() < points.sum():
+                last = number + 1 == most
+                steps = LAST_SETTLING_STEPS if last else SETTLING_STEPS
+                settle_surfaces(solver, alone, found, steps)
     assert found is not None
     return found, extrapolate_steps(np.array(lengths))
 
@@ -552,7 +554,9 @@ def _measure_step(
     return points * far / np.maximum(whole, TINY), points
 
 
-def settle_surfaces(solver: AmplitudeSolver, chosen: NDArray[np.bool_], found: Refinement) -> None:
+def settle_surfaces(
+    solver: AmplitudeSolver, chosen: NDArray[np.bool_], found: Refinement, steps: int
+) -> None:
     """Take further steps on the ranges of some surfaces, (surfaces,), alone, after the step `found`: where
     one has far to go, as a ball on a table, all others and the instrument have long been settled.
     """
@@ -561,7 +565,7 @@ def settle_surfaces(solver: AmplitudeSolver, chosen: NDArray[np.bool_], found: R
     model, own = solver.model, chosen[solver.model.surface]
     apart = _take_apart(solver, np.flatnonzero(chosen))
     step = replace(found, explained=found.explained[:, own], free=None)
-    for _ in range(SETTLING_STEPS):
+    for _ in range(steps):
         before = apart.model.distance
         step = refine_state(apart.model, apart.amplitude, step, instrument=False)
         apart.amplitude = step.amplitude
