@@ -13,12 +13,8 @@ from surface_scene import BIN, BIN_M, CAMERA, INSTRUMENT, SCENE, SHAPE, make_mod
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, depth
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
-from tofclip.recovery.surfaces.fit import (
-    SurfaceFit,
-    extrapolate_steps,
-    find_usual_brightness,
-    straighten_surfaces,
-)
+from tofclip.recovery.surfaces.extents import find_usual_brightness
+from tofclip.recovery.surfaces.fit import SurfaceFit, extrapolate_steps
 from tofclip.recovery.surfaces.model import SurfaceModel, weigh_measurements
 from tofclip.recovery.surfaces.patches import bend_patches, find_plain_patches
 from tofclip.recovery.surfaces.points import SurfaceState
@@ -36,6 +32,7 @@ from tofclip.recovery.surfaces.ranges import (
 )
 from tofclip.recovery.surfaces.returns import estimate_displacement, list_returns
 from tofclip.recovery.surfaces.shapes import QuadricBasis, SmoothBasis, evaluate_monomials
+from tofclip.recovery.surfaces.straighten import straighten_surfaces
 from tofclip.shots import Frames
 from tofclip.simulate import simulate_shot
 

@@ -15,7 +15,8 @@ and the pulse h. With photon weights w the objective is
 `points` says where surfaces are and their light falls, `model` is A(r) at a state of surfaces and
 camera, with its loops in `kernels`; `amplitudes` solves for a by FISTA, `ranges` for the state by
 Gauss-Newton steps. `recovery` is the method that `tofclip recover` runs: `start` lays surfaces out or
-refuses the shot, `fit` has the order of all steps, `returns` lists what was found.
+refuses the shot, `fit` has the order of all steps, of which `extents` says how far surfaces reach,
+`straighten` which shapes they have and `others` what frames see beside them; `returns` lists all.
 docs/recovery_algorithm.md derives it.
 """
 

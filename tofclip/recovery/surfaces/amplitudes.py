@@ -14,6 +14,8 @@ from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import TINY, Image
 
+START_ITERATIONS, REFINEMENT_ITERATIONS = 25, 10  # of what is new, and of what has changed
+AGAINST_DIM = 3.0  # until ranges are known; then amplitudes are as the shot has them
 PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
 # At least and at most, until norms change by as little: where many surfaces share measurements it takes long
 NORM_ITERATIONS, FURTHER_NORM_ITERATIONS, MOST_NORM_ITERATIONS, SETTLED_NORM = 10, 2, 40, 0.02
@@ -94,6 +96,12 @@ class AmplitudeSolver:
         found = self.map_pictures(pool_information, information, self.amplitude)
         # running sums may leave a rounding error below nothing
         return np.asarray(self.amplitude * np.sqrt(np.maximum(found, 0)))
+
+    def measure_misfit(self) -> float:
+        """The weighted sum of squares of what surfaces leave of the shot."""
+        model = self.model
+        rest = model.image - model.render(self.amplitude)
+        return float(np.sum(model.weights * rest**2, dtype=np.float64))
 
     def measure_light(self) -> FloatArray:
         """By how many deviations of a pixel's noise the light of each surface stands out of it, on average

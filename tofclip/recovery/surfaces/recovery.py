@@ -13,12 +13,8 @@ from tofclip.camera.model import interpolate_linearly
 from tofclip.errors import InputError
 from tofclip.lidar import Detection
 from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
-from tofclip.recovery.surfaces.fit import (
-    MAX_REFINEMENTS,
-    REFINEMENT_ITERATIONS,
-    START_ITERATIONS,
-    fit_surfaces,
-)
+from tofclip.recovery.surfaces.amplitudes import REFINEMENT_ITERATIONS, START_ITERATIONS
+from tofclip.recovery.surfaces.fit import MAX_REFINEMENTS, fit_surfaces
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, Image
 from tofclip.recovery.surfaces.returns import list_returns

@@ -14,13 +14,10 @@ from tofclip.camera import Camera
 from tofclip.lidar import Detection
 from tofclip.lidar.range_calibration import correct_returns
 from tofclip.recovery.surfaces.amplitudes import NEIGHBOURHOOD_PX, share_misfit
-from tofclip.recovery.surfaces.fit import (
-    NEAR_BINS,
-    SurfaceFit,
-    find_candidates,
-    find_near,
-)
+from tofclip.recovery.surfaces.extents import find_candidates
+from tofclip.recovery.surfaces.fit import SurfaceFit
 from tofclip.recovery.surfaces.model import SurfaceModel
+from tofclip.recovery.surfaces.others import NEAR_BINS, find_near
 from tofclip.recovery.surfaces.patches import rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
 from tofclip.recovery.surfaces.ranges import measure_local_shifts
