@@ -50,17 +50,18 @@ def grow_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
                 further[one] = scipy.ndimage.binary_dilation(lit[one] & ~within, near) & ~masks[one]
         if not further.any():
             break
-        before, solver = solver, solver.cover(masks | further)
-        solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
-        model, light = solver.model, solver.model.render(solver.amplitude)
-        left, less = (model.image - one for one in (before.model.render(before.amplitude), light))
-        gained = share_misfit(model, solver.amplitude, light, model.weights * (left**2 - less**2))
-        new = further[model.masks] & (solver.amplitude > 0)
+        grown = solver.cover(masks | further)
+        grown.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        model, light = grown.model, grown.model.render(grown.amplitude)
+        left, less = (model.image - one for one in (solver.model.render(solver.amplitude), light))
+        gained = share_misfit(model, grown.amplitude, light, model.weights * (left**2 - less**2))
+        new = further[model.masks] & (grown.amplitude > 0)
         gain, points = (
             np.bincount(model.surface[new], one, growing.size) for one in (gained[new], new[new])
         )
-        growing &= gain > LEAST_GAIN * solver.variance * points
-        solver = solver.cover(masks | further & growing[:, np.newaxis, np.newaxis])
+        growing &= gain > LEAST_GAIN * grown.variance * points
+        if growing.any():
+            solver = grown.cover(masks | further & growing[:, np.newaxis, np.newaxis])
     return solver
 
 

@@ -60,8 +60,9 @@ MIN_REFINEMENTS, MAX_REFINEMENTS = 2, 6
 SPARSELY, FOLLOWING_SPARSELY = ((4.0, 80), (2.0, 20)), ((4.0, 50), (2.0, 10))
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
 LAST_STEP_SIGMAS = 0.15
-# After a longer one of its own a surface goes on alone, for as many steps; more after the last one.
-LONG_STEP_SIGMAS, SETTLING_STEPS, LAST_SETTLING_STEPS = 0.7, 3, 8
+# After a longer one of its own a surface goes on alone, for as many steps, more after the last one, if each
+# leads on that far where the one before led; others are at their end, or nowhere.
+LONG_STEP_SIGMAS, SETTLING_STEPS, LAST_SETTLING_STEPS, GOES_ON = 0.7, 3, 8, 0.5
 # Where the last shot's fit begins: before and after the ranges' step, and how far beyond the returns
 # of quick frames surfaces may reach.
 FOLLOWING_ITERATIONS, FOLLOWING_MARGIN_PX = 10, 4
@@ -328,14 +329,17 @@ def settle_surfaces(
     model, own = solver.model, chosen[solver.model.surface]
     apart = take_apart(solver, np.flatnonzero(chosen))
     step = replace(found, explained=found.explained[:, own], free=None)
+    last = np.zeros(apart.amplitude.size)
     for _ in range(steps):
         before = apart.model.distance
         step = refine_state(apart.model, apart.amplitude, step, instrument=False)
         apart.amplitude = step.amplitude
         apart.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
         far, points = _measure_step(apart, before, step)
-        if far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
+        moved, along = apart.model.distance - before, apart.amplitude * last
+        if far.sum() < LAST_STEP_SIGMAS**2 * points.sum() or moved @ along < GOES_ON * last @ along:
             break
+        last = moved
     state = model.state.copy()
     shapes = zip(np.flatnonzero(chosen), apart.model.state.coefficients, strict=True)
     for surface, coefficients in shapes:
