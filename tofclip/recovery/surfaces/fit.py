@@ -194,11 +194,11 @@ def _measure_blur(solver: AmplitudeSolver) -> AmplitudeSolver:
     best = int(np.argmin(misfits))
     if misfits[best] > LEAST_BLURRED * misfits[0]:
         return solver
+    if best + 1 == len(misfits):
+        return blur(BLURS_PX[best])
     about = slice(best - 1, best + 2)
-    tried = np.array(BLURS_PX[about]), np.array(misfits[about])
-    curve = np.polynomial.Polynomial.fit(*tried, 2)
-    lowest = curve.deriv().roots()[0] if best + 1 < len(misfits) else BLURS_PX[best]
-    return blur(float(lowest))
+    curve = np.polynomial.Polynomial.fit(np.array(BLURS_PX[about]), np.array(misfits[about]), 2)
+    return blur(float(curve.deriv().roots()[0]))
 
 
 @limit_blas_threads()
