@@ -49,7 +49,8 @@ MAX_UNEXPLAINED = 0.4
 # surfaces are not the shot's.
 CHANGED_RATIO = 1.25
 # Of a pulse's light, that long after its peak: more is not an instrument's afterglow (0.18 of one of a
-# quarter of the light), but light that comes from many depths to each pixel (of recorded relay walls two have 0.32 and 0.34, one 0.16).
+# quarter of the light), but light that comes from many depths to each pixel (0.32 and 0.34 of two recorded
+# relay walls, but 0.16 of a third).
 MAX_TAIL_SHARE = 0.21
 # Bins of range that a pixel spans where a surface is seen nearly edge-on, and the share of the
 # returns' light there: returns scatter by several bins about it, and a fit to them would be as far
