@@ -29,9 +29,9 @@ SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
 # Of what certainly is a surface, and beyond: points that are fainter are looked at no further.
 LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 3.5, 0.05, 3
-# A surface that is that certainly lit at so many pixels this near the border of where it may be goes on beyond
-# it, if the shot is explained the better by that much, in the noise's variance for each of its new lit
-# points (7 and more of tables and a plate in 200 photons that do; in 50, up to 2.7 of what does not).
+# Of a surface that goes on beyond the border of where it may be: how far out of the noise it is lit at how many
+# pixels that near the border, and by how much of the noise's variance the misfit falls for each new lit point
+# (7 and more of tables and a plate in 200 photons; in 50, up to 2.7 of surfaces that end there).
 SURELY_LIT_SIGMAS, BORDER_PX, MIN_BORDER_PX, LEAST_GAIN = 5.0, 2, 10, 4.0
 MOST_EXCESS = 4.0  # of the misfit's variance over the noise's: 1 of simulated shots, 60 of the recorded scene5
 
@@ -40,9 +40,9 @@ def grow_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
     """Let surfaces reach further where they are lit up to the border of where they may be, as long as that
     explains the shot better: of one that is dim or turned far, frames in little light show a part.
     """
-    # else it may be what the model does not explain
-    exact = solver.variance < MOST_EXCESS
-    growing = np.array([basis.is_quadratic and exact for basis in solver.model.bases])
+    if solver.variance >= MOST_EXCESS:  # more of it may be what the model does not explain
+        return solver
+    growing = np.array([basis.is_quadratic for basis in solver.model.bases])
     beside, near = (np.ones((2 * far + 1,) * 2) for far in (BORDER_PX, MARGIN_PX))
     while growing.any():
         masks, further = solver.model.masks, np.zeros_like(solver.model.masks)
