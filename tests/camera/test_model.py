@@ -114,7 +114,12 @@ POLYNOMIAL = PolynomialSweep(
 )
 PROJECTIVE = ProjectiveSweep(np.array([[1.0, 0.5, 3.0], [0.0, 2.0, -1.0], [0.001, 0.0, 1.0]]))
 LEANING = ProjectiveSweep(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.01, 1.0]]))
-FOUR = SkewSweep(np.array([0.0, 10, 20, 40]), np.array([0.0, 5, -3, 1]), np.zeros(4))
+FOUR_CENTRES = np.array([0.0, 10, 20, 40])
+# (column / 10)^2 - 1, and 1 % for each 10 columns
+CURVED = SkewSweep(FOUR_CENTRES, np.array([-1.0, 0, 3, 15]), np.array([0.0, 0.01, 0.02, 0.04]))
+# offsets of no parabola: what is left of the nearest, 1/11 of -3, 8, -6, 1 away, is interpolated
+JUMPS = np.array([-3.0, 8, -6, 1]) / 11
+JUMPING = SkewSweep(FOUR_CENTRES, CURVED.offsets_bin + JUMPS, np.zeros(4))
 
 
 @pytest.mark.parametrize(
@@ -127,10 +132,12 @@ FOUR = SkewSweep(np.array([0.0, 10, 20, 40]), np.array([0.0, 5, -3, 1]), np.zero
         (SKEW, (50, 350), (3.5 + (1 - 0.0275) * 50, 350)),
         (SKEW, (50, 50), (-5.5 + (1 + 0.0175) * 50, 50)),
         (SkewSweep([7.0], [3.0], [0.5]), (10, 900), (18, 900)),
-        *(
-            (FOUR, (0, column), (row, column))
-            for column, row in ((-2, -1), (5, 2.5), (10, 5), (15, 1), (20, -3), (30, -1), (50, 3))
-        ),
+        (CURVED, (100, 5), (-0.75 + 1.005 * 100, 5)),
+        (CURVED, (100, -5), (-0.75 + 0.995 * 100, -5)),
+        (CURVED, (100, 50), (24 + 1.05 * 100, 50)),
+        (JUMPING, (0, 20), (3 - 6 / 11, 20)),
+        (JUMPING, (0, 15), (1.25 + 1 / 11, 15)),
+        (JUMPING, (0, 50), (24 + 4.5 / 11, 50)),
         # x = (14 - 10) / 2 = 2 and y = (12 - 20) / 4 = -2:
         # u = 0.5 + 2 + 0 + 0.25 * -4 - 0.1 * 4 + 0.2 * 4 = 1.9, v = -0.5 + 0.2 - 2 + 0.3 * 4 = -1.1
         (POLYNOMIAL, (12, 14), (-1.1 * 5 + 200, 1.9 * 3 + 100)),

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, DTypeLike
 
 from tofclip.arrays import BoolArray, FloatArray
@@ -54,8 +55,8 @@ class SkewSweep(Sweep):
     `centres_px` (views,) are slit columns, increasing, `offsets_bin` (views,) the rows by which
     a view is late, `stretches` (views,) the relative excess of rows per instant.
 
-    Between two centres offset and stretch are interpolated linearly, beyond the outer ones they
-    go on linearly: the sweep's distortion is a smooth function of the slit column.
+    The sweep's distortion is a smooth function of the slit column: everywhere, offset and stretch follow
+    the parabolas nearest to those of the views, and what these leave is interpolated linearly.
     """
 
     RECORD_KIND = "skew_sweep"
@@ -74,8 +75,8 @@ class SkewSweep(Sweep):
             raise CalibrationError(f"sweep centres must increase, got {self.centres_px}")
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        offset = interpolate_linearly(column, self.centres_px, self.offsets_bin)
-        stretch = interpolate_linearly(column, self.centres_px, self.stretches)
+        offset = interpolate_smoothly(column, self.centres_px, self.offsets_bin)
+        stretch = interpolate_smoothly(column, self.centres_px, self.stretches)
         raw_row, raw_column = np.broadcast_arrays(offset + (1.0 + stretch) * row, column)
         return raw_row, raw_column
 
@@ -172,6 +173,17 @@ def interpolate_linearly(position: FloatArray, knots: FloatArray, values: FloatA
     )
     knots = np.concatenate([[knots[0] - far], knots, [knots[-1] + far]])
     return np.asarray(np.interp(position, knots, values))
+
+
+def interpolate_smoothly(position: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
+    """The parabola nearest to the values, and linear interpolation of what it leaves of them. Lines alone
+    would cut the corners of a sweep that is curved, and turn what lies beyond the outer knots: of walls,
+    0.2 mm where the outer views come 0.6 rows later than on a line.
+    """
+    smooth = Polynomial.fit(knots, values, min(2, knots.size - 1))
+    return np.asarray(
+        smooth(position) + interpolate_linearly(position, knots, values - smooth(knots))
+    )
 
 
 # Mean over three set-ups of the same family of instruments (244, 271 and 282 px), fitted to the measured
