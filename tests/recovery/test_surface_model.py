@@ -14,7 +14,7 @@ from tofclip.camera import Camera
 from tofclip.lidar import Detection, depth
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.extents import find_usual_brightness
-from tofclip.recovery.surfaces.fit import SurfaceFit, extrapolate_steps
+from tofclip.recovery.surfaces.fit import SurfaceFit, extrapolate_step
 from tofclip.recovery.surfaces.model import SurfaceModel, weigh_measurements
 from tofclip.recovery.surfaces.patches import bend_patches, find_plain_patches
 from tofclip.recovery.surfaces.points import SurfaceState
@@ -518,9 +518,20 @@ def test_the_objective_holds_what_is_known_of_surfaces_beforehand(shot):
     assert compute_objective(model, rest) == pytest.approx(expected, rel=0.01)
 
 
-def test_what_steps_leave_is_a_geometric_series():
-    lengths = np.array([[8.0, 4.0, 1.0], [2.0, 4.0, 0.0]])
-    np.testing.assert_allclose(extrapolate_steps(lengths), [2 / 3, 4.0, 0.0])
+@pytest.mark.parametrize(
+    ("moved", "earlier", "left"),
+    [
+        ([2, -2], [4, -4], 2.0),  # 1 + 1/2 + 1/4 ...
+        ([-2, 2], [4, -4], 0.0),  # back again: about its end
+        ([2, 2], [4, -4], 0.0),  # anywhere
+        ([2, -2], [2, -2], 6.0),  # hardly shorter: three quarters
+        ([2, -2], [0, 0], 0.0),
+    ],
+)
+def test_what_steps_leave_is_a_geometric_series(moved, earlier, left):
+    light = np.ones(2, np.float32)
+    found = extrapolate_step(np.array(moved, float), np.array(earlier, float), light)
+    assert found == pytest.approx(left)
 
 
 def test_what_steps_take_from_the_misfit_is_given_back():

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
@@ -74,9 +75,23 @@ class SkewSweep(Sweep):
         if not np.all(np.diff(self.centres_px) > 0):
             raise CalibrationError(f"sweep centres must increase, got {self.centres_px}")
 
+    @cached_property
+    def _courses(self) -> list[tuple[Polynomial, FloatArray]]:
+        """Of offsets and stretches, the nearest parabola, and what it leaves of each view's. Lines from view to
+        view would cut the corners of a sweep that is curved, and turn what lies beyond the outer ones: walls by
+        0.2 mm, where the outer views come 0.6 rows later than on a line.
+        """
+        found, centres = [], self.centres_px
+        for values in (self.offsets_bin, self.stretches):
+            parabola = Polynomial.fit(centres, values, min(2, centres.size - 1)).convert()
+            found.append((parabola, values - parabola(centres)))
+        return found
+
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        offset = interpolate_smoothly(column, self.centres_px, self.offsets_bin)
-        stretch = interpolate_smoothly(column, self.centres_px, self.stretches)
+        offset, stretch = (
+            parabola(column) + interpolate_linearly(column, self.centres_px, left)
+            for parabola, left in self._courses
+        )
         raw_row, raw_column = np.broadcast_arrays(offset + (1.0 + stretch) * row, column)
         return raw_row, raw_column
 
@@ -173,17 +188,6 @@ def interpolate_linearly(position: FloatArray, knots: FloatArray, values: FloatA
     )
     knots = np.concatenate([[knots[0] - far], knots, [knots[-1] + far]])
     return np.asarray(np.interp(position, knots, values))
-
-
-def interpolate_smoothly(position: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
-    """The parabola nearest to the values, and linear interpolation of what it leaves of them. Lines alone
-    would cut the corners of a sweep that is curved, and turn what lies beyond the outer knots: of walls,
-    0.2 mm where the outer views come 0.6 rows later than on a line.
-    """
-    smooth = Polynomial.fit(knots, values, min(2, knots.size - 1))
-    return np.asarray(
-        smooth(position) + interpolate_linearly(position, knots, values - smooth(knots))
-    )
 
 
 # Mean over three set-ups of the same family of instruments (244, 271 and 282 px), fitted to the measured

@@ -63,6 +63,10 @@ LAST_STEP_SIGMAS = 0.15
 # After a longer one of its own a surface goes on alone, for as many steps, more after the last one, if each
 # leads on that far where the one before led; others are at their end, or nowhere.
 LONG_STEP_SIGMAS, SETTLING_STEPS, LAST_SETTLING_STEPS, GOES_ON = 0.7, 3, 8, 0.5
+MOST_ONWARD = 0.75  # of a step, how far the next may be thought to lead
+# Rows that a pixel of a steep surface spans, over its light, and the pulses, longer by so many standard
+# deviations, that lead nearer to it, one after the other.
+STEEP_ROWS, LONGER_PULSES = 4.0, (12.0, 4.0)
 # Where the last shot's fit begins: before and after the ranges' step, and how far beyond the returns
 # of quick frames surfaces may reach.
 FOLLOWING_ITERATIONS, FOLLOWING_MARGIN_PX = 10, 4
@@ -146,10 +150,12 @@ def _fit_returns(
     # 5. Ranges, after splines that are not needed: these take longer to be right, and late views give
     # way to them.
     solver, begun = straighten_surfaces(solver)
+    _approach_steep(solver)
     refinement, remainder = _refine(solver, begun, tick)
     grown = grow_surfaces(solver)
     if grown is not solver:
         solver = keep_lit(grown)
+        _approach_steep(solver)
         refinement, remainder = _refine(solver, refinement.cover(solver.model))
     if solver.model.pulse.reach:
         # what seemed a tail may have been ranges that were off
@@ -268,6 +274,32 @@ def _explain_sparsely(
     return sparse
 
 
+def _approach_steep(solver: AmplitudeSolver) -> None:
+    """Take steps on ranges as longer pulses show them, where a surface is steep. Returns of frames are off by
+    many pulses there; and as light may be a part of a pixel higher where its range is longer, steps that see
+    each pulse's place lead a tenth of the way.
+    """
+    model = solver.model
+    rows, light = (
+        np.hypot(*model.compute_slopes()) / model.row_m,
+        solver.amplitude + np.float32(TINY),
+    )
+    if all(np.average(rows[part], weights=light[part]) < STEEP_ROWS for part in model.parts):
+        return
+    for pulses in LONGER_PULSES:
+        coarse = AmplitudeSolver(
+            model.lengthen(pulses * model.pulse.sigma, solver.amplitude),
+            solver.amplitude,
+            solver.weight,
+            solver,
+        )
+        coarse.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        step = refine_state(coarse.model, coarse.amplitude, instrument=False)
+        model.place(coarse.model.state)
+        solver.amplitude = step.amplitude
+    solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+
+
 def _refine(
     solver: AmplitudeSolver,
     found: Refinement | None,
@@ -277,17 +309,14 @@ def _refine(
     """Steps on ranges and instrument until they hardly move; the last one, and what more would
     change of each surface.
     """
-    model, lengths = solver.model, []
+    model, moved = solver.model, np.zeros(solver.amplitude.size)
     for number in range(most):
         before = model.distance
         model.find_behind(solver.amplitude)
         found = refine_state(model, solver.amplitude, found, number + 1 >= MIN_REFINEMENTS)
         solver.amplitude = found.amplitude
         solver.run(REFINEMENT_ITERATIONS, tick, AGAINST_DIM)
-        # where a surface is dark, it may go anywhere
-        light = solver.amplitude + np.finfo(np.float32).tiny
-        squares = (model.distance - before) ** 2
-        lengths.append([np.sqrt(np.average(squares[p], weights=light[p])) for p in model.parts])
+        earlier, moved = moved, model.distance - before
         far, points = _measure_step(solver, before, found)
         if number + 1 >= MIN_REFINEMENTS:
             if far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
@@ -299,7 +328,10 @@ def _refine(
                 steps = LAST_SETTLING_STEPS if last else SETTLING_STEPS
                 settle_surfaces(solver, alone, found, steps)
     assert found is not None
-    return found, extrapolate_steps(np.array(lengths))
+    # where a surface is dark, it may go anywhere
+    light = solver.amplitude + np.float32(TINY)
+    remainder = [extrapolate_step(moved[p], earlier[p], light[p]) for p in model.parts]
+    return found, np.array(remainder)
 
 
 def _measure_step(
@@ -348,10 +380,10 @@ def settle_surfaces(
     solver.amplitude[own] = apart.amplitude
 
 
-def extrapolate_steps(lengths: FloatArray) -> FloatArray:
-    """Return how far steps, (steps, n), two or more, that shrink as the last two did would still go:
-    the sum of a geometric series; steps that do not shrink count as if they halved.
+def extrapolate_step(last: FloatArray, earlier: FloatArray, light: Image) -> float:
+    """Return how far the steps of a surface would still go, root mean square over its light, if each leads on as
+    the last did from the one before: the sum of a geometric series. All (points,).
     """
-    tiny = np.finfo(np.float64).tiny
-    ratio = np.minimum(lengths[-1] / np.maximum(lengths[-2], tiny), 0.5)
-    return np.asarray(lengths[-1] * ratio / (1 - ratio))
+    onward = float(light @ (last * earlier)) / max(float(light @ earlier**2), TINY)
+    ratio = min(max(onward, 0.0), MOST_ONWARD)
+    return float(np.sqrt(np.average(last**2, weights=light))) * ratio / (1 - ratio)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 from typing import Self
 
@@ -159,6 +159,26 @@ class SurfaceModel(SurfacePoints):
         other.pulse = pulse
         other.place(self.state)
         return other
+
+    def lengthen(self, sigma: float, amplitude: Image) -> Self:
+        """Return the same surfaces before the shot as a longer pulse shows it, smoothed along rows: there those that
+        are several pulses off still meet their light. What is not valid is taken to be as amplitudes say.
+        """
+        valid = self.weights > 0
+        image, variance = (
+            np.where(valid, self.image, self.render(amplitude)),
+            np.zeros_like(self.image),
+        )
+        np.divide(1, self.weights, out=variance, where=valid)
+        longer = self.respond(replace(self.pulse, sigma=float(np.hypot(self.pulse.sigma, sigma))))
+        longer.image, around = (
+            scipy.ndimage.gaussian_filter1d(one, sigma, axis=0) for one in (image, variance)
+        )
+        longer.weights = np.zeros_like(around)
+        # of a mean of independent measurements
+        of_one = 2 * np.sqrt(np.pi) * np.float32(sigma)
+        np.divide(of_one, around, out=longer.weights, where=valid & (around > 0))
+        return longer
 
     def blur(self, sigma_px: float) -> Self:
         """Return the same surfaces as an instrument shows them that blurs along the slit."""
