@@ -150,12 +150,14 @@ def _fit_returns(
     # 5. Ranges, after splines that are not needed: these take longer to be right, and late views give
     # way to them.
     solver, begun = straighten_surfaces(solver)
-    _approach_steep(solver)
+    if darkness <= DIM:  # in less light a longer pulse is one with what is beside it
+        _approach_steep(solver)
     refinement, remainder = _refine(solver, begun, tick)
     grown = grow_surfaces(solver)
     if grown is not solver:
         solver = keep_lit(grown)
-        _approach_steep(solver)
+        if darkness <= DIM:
+            _approach_steep(solver)
         refinement, remainder = _refine(solver, refinement.cover(solver.model))
     if solver.model.pulse.reach:
         # what seemed a tail may have been ranges that were off
