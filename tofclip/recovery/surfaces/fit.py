@@ -64,9 +64,9 @@ LAST_STEP_SIGMAS = 0.15
 # leads on that far where the one before led; others are at their end, or nowhere.
 LONG_STEP_SIGMAS, SETTLING_STEPS, LAST_SETTLING_STEPS, GOES_ON = 0.7, 3, 8, 0.5
 MOST_ONWARD = 0.75  # of a step, how far the next may be thought to lead
-# Rows that a pixel of a steep surface spans, over its light, and the pulses, longer by so many standard
-# deviations, that lead nearer to it, one after the other.
-STEEP_ROWS, LONGER_PULSES = 4.0, (12.0, 4.0)
+# In the pulse's standard deviations: the range that a pixel of a steep surface spans, mean over its light, and
+# by how much the pulses are longer that lead nearer to it, one after the other.
+STEEP_PULSES, LONGER_PULSES = 3.0, (12.0, 4.0)
 # Where the last shot's fit begins: before and after the ranges' step, and how far beyond the returns
 # of quick frames surfaces may reach.
 FOLLOWING_ITERATIONS, FOLLOWING_MARGIN_PX = 10, 4
@@ -282,15 +282,13 @@ def _approach_steep(solver: AmplitudeSolver) -> None:
     each pulse's place lead a tenth of the way.
     """
     model = solver.model
-    rows, light = (
-        np.hypot(*model.compute_slopes()) / model.row_m,
-        solver.amplitude + np.float32(TINY),
-    )
-    if all(np.average(rows[part], weights=light[part]) < STEEP_ROWS for part in model.parts):
+    sigma, light = model.pulse.sigma, solver.amplitude + np.float32(TINY)
+    spans = np.hypot(*model.compute_slopes()) / (sigma * model.row_m)
+    if all(np.average(spans[part], weights=light[part]) < STEEP_PULSES for part in model.parts):
         return
     for pulses in LONGER_PULSES:
         coarse = AmplitudeSolver(
-            model.lengthen(pulses * model.pulse.sigma, solver.amplitude),
+            model.lengthen(pulses * sigma, solver.amplitude),
             solver.amplitude,
             solver.weight,
             solver,
