@@ -57,7 +57,7 @@ PULSE_ITERATIONS = 10  # of those at the start, before the pulse is measured
 MIN_REFINEMENTS, MAX_REFINEMENTS = 2, 6
 # What dim light costs, in deviations, and for how many iterations at most, where it is to stay only as
 # the shot needs it: first it gives way, then what is needed comes back. Fewer after the first shot.
-SPARSELY, FOLLOWING_SPARSELY = ((4.0, 80), (2.0, 20)), ((4.0, 50), (2.0, 10))
+SPARSELY, FOLLOWING_SPARSELY = ((4.0, 80), (2.0, 20)), ((4.0, 30), (2.0, 10))
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
 LAST_STEP_SIGMAS = 0.15
 # After a longer one of its own a surface goes on alone, for as many steps, more after the last one, if each
