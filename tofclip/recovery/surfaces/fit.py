@@ -287,16 +287,11 @@ def _approach_steep(solver: AmplitudeSolver) -> None:
     if all(np.average(spans[part], weights=light[part]) < STEEP_PULSES for part in model.parts):
         return
     for pulses in LONGER_PULSES:
-        coarse = AmplitudeSolver(
-            model.lengthen(pulses * sigma, solver.amplitude),
-            solver.amplitude,
-            solver.weight,
-            solver,
-        )
-        coarse.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
-        step = refine_state(coarse.model, coarse.amplitude, instrument=False)
-        model.place(coarse.model.state)
-        solver.amplitude = step.amplitude
+        longer = model.lengthen(pulses * sigma, solver.amplitude)
+        trial = AmplitudeSolver(longer, solver.amplitude, solver.weight, solver)
+        trial.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        solver.amplitude = refine_state(longer, trial.amplitude, instrument=False).amplitude
+        model.place(longer.state)
     solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
 
 

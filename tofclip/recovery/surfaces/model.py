@@ -164,11 +164,8 @@ class SurfaceModel(SurfacePoints):
         """Return the same surfaces before the shot as a longer pulse shows it, smoothed along rows: there those that
         are several pulses off still meet their light. What is not valid is taken to be as amplitudes say.
         """
-        valid = self.weights > 0
-        image, variance = (
-            np.where(valid, self.image, self.render(amplitude)),
-            np.zeros_like(self.image),
-        )
+        valid, variance = self.weights > 0, np.zeros_like(self.weights)
+        image = np.where(valid, self.image, self.render(amplitude))
         np.divide(1, self.weights, out=variance, where=valid)
         longer = self.respond(replace(self.pulse, sigma=float(np.hypot(self.pulse.sigma, sigma))))
         longer.image, around = (
