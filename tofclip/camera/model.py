@@ -76,7 +76,7 @@ class SkewSweep(Sweep):
             raise CalibrationError(f"sweep centres must increase, got {self.centres_px}")
 
     @cached_property
-    def _courses(self) -> list[tuple[Polynomial, FloatArray]]:
+    def _parabolas(self) -> list[tuple[Polynomial, FloatArray]]:
         """Of offsets and stretches, the nearest parabola, and what it leaves of each view's. Lines from view to
         view would cut the corners of a sweep that is curved, and turn what lies beyond the outer ones: walls by
         0.2 mm, where the outer views come 0.6 rows later than on a line.
@@ -90,7 +90,7 @@ class SkewSweep(Sweep):
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
         offset, stretch = (
             parabola(column) + interpolate_linearly(column, self.centres_px, left)
-            for parabola, left in self._courses
+            for parabola, left in self._parabolas
         )
         raw_row, raw_column = np.broadcast_arrays(offset + (1.0 + stretch) * row, column)
         return raw_row, raw_column

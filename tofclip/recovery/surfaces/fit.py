@@ -150,14 +150,12 @@ def _fit_returns(
     # 5. Ranges, after splines that are not needed: these take longer to be right, and late views give
     # way to them.
     solver, begun = straighten_surfaces(solver)
-    if darkness <= DIM:  # in less light a longer pulse is one with what is beside it
-        _approach_steep(solver)
+    _approach_steep(solver, darkness)
     refinement, remainder = _refine(solver, begun, tick)
     grown = grow_surfaces(solver)
     if grown is not solver:
         solver = keep_lit(grown)
-        if darkness <= DIM:
-            _approach_steep(solver)
+        _approach_steep(solver, darkness)
         refinement, remainder = _refine(solver, refinement.cover(solver.model))
     if solver.model.pulse.reach:
         # what seemed a tail may have been ranges that were off
@@ -276,11 +274,13 @@ def _explain_sparsely(
     return sparse
 
 
-def _approach_steep(solver: AmplitudeSolver) -> None:
+def _approach_steep(solver: AmplitudeSolver, darkness: float) -> None:
     """Take steps on ranges as longer pulses show them, where a surface is steep. Returns of frames are off by
     many pulses there; and as light may be a part of a pixel higher where its range is longer, steps that see
-    each pulse's place lead a tenth of the way.
+    each pulse's place lead a tenth of the way. In little light a longer pulse is one with what is beside it.
     """
+    if darkness > DIM:
+        return
     model = solver.model
     sigma, light = model.pulse.sigma, solver.amplitude + np.float32(TINY)
     spans = np.hypot(*model.compute_slopes()) / (sigma * model.row_m)
@@ -312,7 +312,7 @@ def _refine(
         solver.amplitude = found.amplitude
         solver.run(REFINEMENT_ITERATIONS, tick, AGAINST_DIM)
         earlier, moved = moved, model.distance - before
-        far, points = _measure_step(solver, before, found)
+        far, points = _measure_step(solver, moved, found)
         if number + 1 >= MIN_REFINEMENTS:
             if far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
                 break
@@ -330,17 +330,17 @@ def _refine(
 
 
 def _measure_step(
-    solver: AmplitudeSolver, before: FloatArray, found: Refinement
+    solver: AmplitudeSolver, moved: FloatArray, found: Refinement
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """How far ranges went of each surface, the sum of squares over its lit points in their deviations, and
-    how many these are, (surfaces,) each, the more a point counts the more light it has; `before`: ranges,
-    (points,).
+    how many these are, (surfaces,) each, the more a point counts the more light it has; `moved`: ranges, by
+    so much, (points,).
     """
     model, light = solver.model, solver.amplitude
-    moved = (model.distance - before) / model.estimate_deviation(found.covariances)
+    sigmas = moved / model.estimate_deviation(found.covariances)
     far, whole, points = (
         np.bincount(model.surface, one, len(model.parts))
-        for one in (light * moved**2, light, light > 0)
+        for one in (light * sigmas**2, light, light > 0)
     )
     return points * far / np.maximum(whole, TINY), points
 
@@ -356,17 +356,18 @@ def settle_surfaces(
     model, own = solver.model, chosen[solver.model.surface]
     apart = take_apart(solver, np.flatnonzero(chosen))
     step = replace(found, explained=found.explained[:, own], free=None)
-    last = np.zeros(apart.amplitude.size)
-    for _ in range(steps):
+    moved = np.zeros(apart.amplitude.size)
+    for number in range(steps):
         before = apart.model.distance
         step = refine_state(apart.model, apart.amplitude, step, instrument=False)
         apart.amplitude = step.amplitude
         apart.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
-        far, points = _measure_step(apart, before, step)
-        moved, along = apart.model.distance - before, apart.amplitude * last
-        if far.sum() < LAST_STEP_SIGMAS**2 * points.sum() or moved @ along < GOES_ON * last @ along:
+        earlier, moved = moved, apart.model.distance - before
+        far, points = _measure_step(apart, moved, step)
+        if far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
             break
-        last = moved
+        if number and _lead_on(moved, earlier, apart.amplitude) < GOES_ON:
+            break
     state = model.state.copy()
     shapes = zip(np.flatnonzero(chosen), apart.model.state.coefficients, strict=True)
     for surface, coefficients in shapes:
@@ -379,6 +380,10 @@ def extrapolate_step(last: FloatArray, earlier: FloatArray, light: Image) -> flo
     """Return how far the steps of a surface would still go, root mean square over its light, if each leads on as
     the last did from the one before: the sum of a geometric series. All (points,).
     """
-    onward = float(light @ (last * earlier)) / max(float(light @ earlier**2), TINY)
-    ratio = min(max(onward, 0.0), MOST_ONWARD)
+    ratio = min(max(_lead_on(last, earlier, light), 0.0), MOST_ONWARD)
     return float(np.sqrt(np.average(last**2, weights=light))) * ratio / (1 - ratio)
+
+
+def _lead_on(last: FloatArray, earlier: FloatArray, light: Image) -> float:
+    """How far a step leads where the one before it led, as a part of how far that led; all (points,)."""
+    return float(light @ (last * earlier)) / max(float(light @ earlier**2), TINY)

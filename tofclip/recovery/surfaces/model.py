@@ -28,6 +28,7 @@ from tofclip.recovery.surfaces.points import SLIT_PIXELS, SurfacePoints, Surface
 from tofclip.recovery.surfaces.pulse import (
     EXTENT_SIGMAS,
     SPLINE_LEFT_VARIANCE,
+    TINY,
     Image,
     ShotPulse,
     make_pulse,
@@ -164,17 +165,16 @@ class SurfaceModel(SurfacePoints):
         """Return the same surfaces before the shot as a longer pulse shows it, smoothed along rows: there those that
         are several pulses off still meet their light. What is not valid is taken to be as amplitudes say.
         """
-        valid, variance = self.weights > 0, np.zeros_like(self.weights)
+        valid = self.weights > 0
         image = np.where(valid, self.image, self.render(amplitude))
-        np.divide(1, self.weights, out=variance, where=valid)
+        variance = valid / np.maximum(self.weights, TINY)
         longer = self.respond(replace(self.pulse, sigma=float(np.hypot(self.pulse.sigma, sigma))))
         longer.image, around = (
             scipy.ndimage.gaussian_filter1d(one, sigma, axis=0) for one in (image, variance)
         )
-        longer.weights = np.zeros_like(around)
-        # of a mean of independent measurements
-        of_one = 2 * np.sqrt(np.pi) * np.float32(sigma)
-        np.divide(of_one, around, out=longer.weights, where=valid & (around > 0))
+        # the variance of a mean of independent measurements is so many times less
+        averaged = np.float32(2 * np.sqrt(np.pi) * sigma)
+        longer.weights = valid * averaged / np.maximum(around, TINY)
         return longer
 
     def blur(self, sigma_px: float) -> Self:

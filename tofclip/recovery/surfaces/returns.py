@@ -46,7 +46,7 @@ SHIFT_SHOWN = 1 / 3
 ROD_FRACTION, ROD_PX = 0.1, 0.12
 # Of a pixel, root mean square, light lies higher or lower than where it is put: views tell rows only by how
 # their lines lean. Tables that are turned are off by 0.02 to 0.05 of what a pixel spans.
-HIGHER_PX = 0.02
+ROW_ERROR_PX = 0.02
 # Middle of a part of a pixel from the pixel's own, root mean square over parts of all sizes.
 PART_PX = 1 / np.sqrt(12)
 
@@ -76,7 +76,7 @@ def list_returns(
 
     fitted = model.estimate_deviation(fit.refinement.covariances)
     begun_px = model.camera.centres_px if calibrated_px is None else calibrated_px
-    displaced = np.hypot(estimate_displacement(camera, begun_px), (0, HIGHER_PX))
+    displaced = np.hypot(estimate_displacement(camera, begun_px), (0, ROW_ERROR_PX))
     moved = displaced[:, np.newaxis] * model.compute_slopes()
     rest = model.image - fit.whole.model.render(fit.whole.amplitude)
     bent = measure_local_shifts(model, amplitude, rest) / SHIFT_SHOWN
