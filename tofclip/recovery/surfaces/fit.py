@@ -4,6 +4,7 @@ of the shot before, are taken, their amplitudes and ranges fitted, and the frame
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,6 +22,8 @@ from tofclip.recovery.surfaces.amplitudes import (
     START_ITERATIONS,
     AmplitudeSolver,
     Tick,
+    explain_by_amplitude,
+    scale_amplitude,
 )
 from tofclip.recovery.surfaces.extents import grow_surfaces, join_surfaces, keep_lit, take_apart
 from tofclip.recovery.surfaces.model import SurfaceModel
@@ -33,7 +36,7 @@ from tofclip.recovery.surfaces.pulse import (
     Image,
     measure_pulse,
 )
-from tofclip.recovery.surfaces.ranges import Refinement, refine_state
+from tofclip.recovery.surfaces.ranges import FREE_ITERATIONS, Refinement, refine_state
 from tofclip.recovery.surfaces.start import (
     CHANGED_RATIO,
     DIM,
@@ -74,9 +77,9 @@ CHANGED_EXCESS = 0.02  # beyond `CHANGED_RATIO` of what surfaces left unexplaine
 
 
 # Standard deviations of a blur along the slit, px, that are tried until one explains the shot less well than
-# the one before, each for as many iterations, and what has to be left of the misfit without it (0.3 of a shot
-# of 2000 photons, 0.98 of the recorded scene5; 0.997 of one that is not blurred, of leaves).
-BLURS_PX, BLUR_ITERATIONS, LEAST_BLURRED = (0.0, 0.7, 1.0, 1.3, 1.6, 2.0, 2.5, 3.0), 10, 0.985
+# the one before; what has to be left of the misfit with the one that was known (0.3 of a shot of 2000 photons,
+# 0.96 of the recorded scene5; 0.997 of one that is not blurred, of leaves); how often it is measured anew.
+BLURS_PX, LEAST_BLURRED, BLUR_ROUNDS = (0.0, 0.7, 1.0, 1.3, 1.6, 2.0, 2.5, 3.0), 0.985, 4
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,7 @@ def _fit_returns(
     # 4. Amplitudes, and the pulse as they show it.
     solver.run(PULSE_ITERATIONS, tick, AGAINST_DIM)
     solver = _measure_pulse(solver)
+    require_pulse(solver.model.pulse)
     solver.run(START_ITERATIONS - PULSE_ITERATIONS, tick, AGAINST_DIM)
     limit = np.hypot(MAX_UNEXPLAINED, darkness)
     if solver.model.unexplained(solver.amplitude) > limit:
@@ -144,19 +148,18 @@ def _fit_returns(
     if darkness > DIM:
         # frames show so little of some that others take their light
         solver = grow_surfaces(solver)
-    solver = _measure_blur(join_surfaces(keep_lit(solver)))
-    solver.model.find_behind(solver.amplitude)
+    begun = _measure_blur(join_surfaces(keep_lit(solver)))
 
-    # 5. Ranges, after splines that are not needed: these take longer to be right, and late views give
-    # way to them.
-    solver, begun = straighten_surfaces(solver)
-    _approach_steep(solver, darkness)
-    refinement, remainder = _refine(solver, begun, tick)
-    grown = grow_surfaces(solver)
-    if grown is not solver:
-        solver = keep_lit(grown)
-        _approach_steep(solver, darkness)
-        refinement, remainder = _refine(solver, refinement.cover(solver.model))
+    # 5. Ranges.
+    solver, refinement, remainder = _fit_ranges(begun, darkness, tick)
+    for _ in range(BLUR_ROUNDS if solver.model.blur_px else 0):
+        # what returns of frames were off by hid a part of the blur
+        better = _measure_blur(solver)
+        if better is solver:
+            break
+        model = begun.model.respond(better.model.pulse).blur(better.model.blur_px)
+        again = AmplitudeSolver(model, begun.amplitude, weight, begun)
+        solver, refinement, remainder = _fit_ranges(again, darkness)
     if solver.model.pulse.reach:
         # what seemed a tail may have been ranges that were off
         plain = _measure_pulse(solver, np.inf)
@@ -171,40 +174,64 @@ def _fit_returns(
     return SurfaceFit(solver, sparse, refinement, remainder, reference, *beside, found)
 
 
+def _fit_ranges(
+    begun: AmplitudeSolver, darkness: float, tick: Tick = lambda: None
+) -> tuple[AmplitudeSolver, Refinement, FloatArray]:
+    """Fit ranges, and straighten splines that are not needed first: these take longer to be right, and late views
+    give way to them. `begun` stays as it is.
+    """
+    solver = AmplitudeSolver(copy.copy(begun.model), begun.amplitude, begun.weight, begun)
+    solver.model.find_behind(solver.amplitude)
+    solver, straightened = straighten_surfaces(solver)
+    _approach_steep(solver, darkness)
+    refinement, remainder = _refine(solver, straightened, tick)
+    grown = grow_surfaces(solver)
+    if grown is not solver:
+        solver = keep_lit(grown)
+        _approach_steep(solver, darkness)
+        refinement, remainder = _refine(solver, refinement.cover(solver.model))
+    return solver, refinement, remainder
+
+
 def _measure_pulse(solver: AmplitudeSolver, least_tail: float = LEAST_TAIL) -> AmplitudeSolver:
     """Give surfaces the pulse that the shot shows, without a tail of less than a part of the light."""
     model, light = solver.model, solver.model.render_instants(solver.amplitude)
     width = model.camera.pulse_fwhm / model.bin_width
     least_tail = max(least_tail, LEAST_EXPLAINED * model.unexplained(solver.amplitude))
     pulse = measure_pulse(light, model.image, model.weights, width, least_tail)
-    require_pulse(pulse)
-    if (pulse.sigma, pulse.reach) == (model.pulse.sigma, model.pulse.reach):
-        return solver
     return AmplitudeSolver(model.respond(pulse), solver.amplitude, solver.weight, solver)
 
 
 def _measure_blur(solver: AmplitudeSolver) -> AmplitudeSolver:
-    """Give surfaces the blur along the slit, as of a streak tube, with which they explain the shot best."""
+    """Give surfaces the blur along the slit, as of a streak tube, with which they explain the shot best, and the
+    pulse that is left then: light of other ranges that a blur brings seems to come earlier and later.
+    """
+    model, amplitude = solver.model, solver.amplitude
 
-    def blur(sigma_px: float) -> AmplitudeSolver:
-        blurred = solver.model.blur(sigma_px)
-        trial = AmplitudeSolver(blurred, solver.amplitude, solver.weight, solver)
-        trial.run(BLUR_ITERATIONS, against_dim=AGAINST_DIM)
-        return trial
+    def find_misfit(sigma_px: float) -> float:
+        blurred = model.blur(sigma_px)
+        rest = blurred.image - blurred.render(amplitude)
+        scale, none = scale_amplitude(blurred, amplitude > 0), np.zeros_like(amplitude)
+        change = explain_by_amplitude(blurred, rest, none, scale, FREE_ITERATIONS)
+        rest -= blurred.render(change)
+        return float(np.sum(model.weights * rest**2, dtype=np.float64))
 
     misfits: list[float] = []
     for sigma_px in BLURS_PX:
-        misfits.append(blur(sigma_px).measure_misfit())
+        misfits.append(find_misfit(sigma_px))
         if misfits[-1] > min(misfits):
             break
     best = int(np.argmin(misfits))
-    if misfits[best] > LEAST_BLURRED * misfits[0]:
+    sigma_px = BLURS_PX[best]
+    if 0 < best < len(misfits) - 1:
+        about = slice(best - 1, best + 2)
+        curve = np.polynomial.Polynomial.fit(np.array(BLURS_PX[about]), np.array(misfits[about]), 2)
+        sigma_px = float(curve.deriv().roots()[0])
+    if find_misfit(sigma_px) > LEAST_BLURRED * find_misfit(model.blur_px):
         return solver
-    if best + 1 == len(misfits):
-        return blur(BLURS_PX[best])
-    about = slice(best - 1, best + 2)
-    curve = np.polynomial.Polynomial.fit(np.array(BLURS_PX[about]), np.array(misfits[about]), 2)
-    return blur(float(curve.deriv().roots()[0]))
+    blurred = AmplitudeSolver(model.blur(sigma_px), amplitude, solver.weight, solver)
+    blurred.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+    return _measure_pulse(blurred)
 
 
 @limit_blas_threads()

@@ -54,6 +54,7 @@ SWEEP_DOUBT, PULL_SIGMAS = 0.1, 2.0
 CENTRE_SIGMA_PX, DISPLACEMENT_SIGMA_PX = 0.3, 1e-3
 # Of the brightness behind another surface, between the views: less does not matter, or is noise.
 MIN_SHADING, SHADING_SIGMAS = 0.1, 3.0
+MOST_SHADING = 3.0  # what hardly anything shows may be thought to be as dark, or bright
 # Of conjugate gradients. Smooth changes of amplitude, which matter for a derivative, converge first,
 # and those of the last step are nearly right.
 ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 6, 2
@@ -668,8 +669,9 @@ def _move(
         ahead[part] += along.astype(np.float32) @ changes[: along.size, part]
     # the mean gain is the amplitudes' unit, and so is the mean brightness behind a surface
     brighter, shading = moved.gains.mean() / state.gains.mean(), moved.shading.mean(axis=1)
+    shading = np.clip(shading, -MOST_SHADING, MOST_SHADING)
     moved.gains /= brighter
-    moved.shading -= shading[:, np.newaxis]
+    moved.shading = np.clip(moved.shading - shading[:, np.newaxis], -MOST_SHADING, MOST_SHADING)
     ahead = np.float32(brighter) * np.maximum(ahead, 0)
     ahead *= np.where(model.behind, np.exp(shading)[model.surface], 1).astype(np.float32)
     model.place(moved)

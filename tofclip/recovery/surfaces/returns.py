@@ -40,10 +40,11 @@ ABOUT_PX = 5  # side of the square
 # the rest. Medians over ten kinds of bent surfaces of known range are 0.13 to 0.75.
 SHIFT_SHOWN = 1 / 3
 
-# A surface that fills as little of the square over its length is a rod, whose roundness no pixel
-# resolves; and by how much of a pixel's width, root mean square, its points are off for that: those
-# of rods of 10 and 12 mm are off by 0.07 to 0.17.
-ROD_FRACTION, ROD_PX = 0.1, 0.12
+# A surface that fills as little of the square over its length is a rod, whose roundness no pixel resolves; its
+# radius if its light is within such a distance of its axis, root mean square: that of what is seen as a line;
+# and by how much of a pixel's width, root mean square, its points are off: those of rods of 10 and 12 mm, whose
+# radii are 0.3 to 0.8 px, by 0.05 to 0.1.
+ROD_FRACTION, ROD_RADIUS_PX, ROD_SPREAD_PX, ROD_PX = 0.1, 0.6, 1.0, 0.08
 # Of a pixel, root mean square, light lies higher or lower than where it is put: views tell rows only by how
 # their lines lean. Tables that are turned are off by 0.02 to 0.05 of what a pixel spans.
 ROW_ERROR_PX = 0.02
@@ -81,13 +82,17 @@ def list_returns(
     rest = model.image - fit.whole.model.render(fit.whole.amplitude)
     bent = measure_local_shifts(model, amplitude, rest) / SHIFT_SHOWN
     y, x = model.row[chosen], model.column[chosen]
-    rounded = np.zeros(distance.size)
+    depth, rounded = np.zeros((2, distance.size))
     for surface in np.unique(model.surface[chosen]):
         own = model.surface[chosen] == surface
-        # points that may be false fill a part
-        filled = np.sum(1 - doubt[strong][own])
-        if filled < ROD_FRACTION * (np.ptp(y[own]) ** 2 + np.ptp(x[own]) ** 2):
-            rounded[chosen[own]] = ROD_PX * distance[chosen[own]] / camera.focal_length_px
+        true = 1 - doubt[strong][own]  # points that may be false fill a part
+        if true.sum() < ROD_FRACTION * (np.ptp(y[own]) ** 2 + np.ptp(x[own]) ** 2):
+            rod, pixel_m = chosen[own], distance[chosen[own]] / camera.focal_length_px
+            light = true * fit.sparse.amplitude[rod] + TINY
+            depth[rod] = pixel_m * round_rod(y[own], x[own], light)
+            rounded[rod] = ROD_PX * pixel_m
+    distance = distance + depth
+    time = 2 * distance / SPEED_OF_LIGHT
     hidden = estimate_hidden_shift(model, amplitude)
     parts = np.stack([fitted, fit.remainder[model.surface], *moved, bent, rounded, hidden])
     deviation = np.sqrt(np.sum(parts**2, axis=0) + model.estimate_sweep_error() ** 2)
@@ -103,6 +108,29 @@ def list_returns(
         false_alarm=doubt[strong],
     ).merge(others)
     return correct_returns(replace(found, shear=np.asarray(camera.shear_at(found.range))))
+
+
+def round_rod(y: Pixels, x: Pixels, light: FloatArray) -> FloatArray:
+    """Return by how much farther than a line along it the pixels of a rod see it, (n,), px: what is as thin as
+    pixels is taken to be round, and pixels at its sides see these. `light`: of the pixels, by which its axis, a
+    parabola, is found; (n,).
+    """
+    place = np.stack([x, y], axis=1) - np.average(np.stack([x, y], axis=1), axis=0, weights=light)
+    _, axes = np.linalg.eigh(place.T @ (place * light[:, np.newaxis]))
+    across, along = (place @ axes).T
+    course, root = np.vander(along, 3), np.sqrt(light)
+    aside = across - course @ np.linalg.lstsq(course * root[:, np.newaxis], across * root)[0]
+    if np.average(aside**2, weights=light) > ROD_SPREAD_PX**2:
+        return np.zeros(light.size)
+    # from its axis to its limb, the part that each pixel sees, as wide as a pixel looks from there
+    reach = np.abs(axes[:, 0]).sum() / 2
+    ends = np.array([aside - reach, aside + reach]) / ROD_RADIUS_PX
+    near, far = np.clip(ends[0], -1, 0.9), np.clip(ends[1], -0.9, 1)
+    area = (
+        far * np.sqrt(1 - far**2) + np.arcsin(far) - near * np.sqrt(1 - near**2) - np.arcsin(near)
+    )
+    # a line is where its light is, which faces the camera
+    return ROD_RADIUS_PX * (8 / (3 * np.pi) - area / 2 / (far - near))
 
 
 def estimate_hidden_shift(model: SurfaceModel, amplitude: Image) -> FloatArray:
