@@ -29,7 +29,7 @@ PLACE_PX, BESIDE_PX, DIM_PART, REWEIGHT_ITERATIONS = 3, 15, 0.75, 10
 # Of the deviations by which the brightest is out of the noise: what dim light costs at most
 CAPPED_COST = 0.5
 # Deviations of a pixel's noise: iterations that change each surface by less, root mean square, are enough
-SETTLED_SIGMAS = 0.003
+SETTLED_SIGMAS = 0.01
 MISFIT_PX = 4.0  # about a measurement, by whose misfit it is judged
 LEAST_COUNT = 1e-3  # of light in a measurement, for it to be any surface's
 

@@ -36,7 +36,7 @@ from tofclip.recovery.surfaces.pulse import (
     Image,
     measure_pulse,
 )
-from tofclip.recovery.surfaces.ranges import FREE_ITERATIONS, Refinement, refine_state
+from tofclip.recovery.surfaces.ranges import FURTHER_FREE_ITERATIONS, Refinement, refine_state
 from tofclip.recovery.surfaces.start import (
     CHANGED_RATIO,
     DIM,
@@ -89,7 +89,7 @@ class SurfaceFit:
     solver: AmplitudeSolver
     sparse: AmplitudeSolver  # the same with dim light beside bright only where the shot needs it
     refinement: Refinement  # the last one
-    remainder: FloatArray  # (surfaces,), what further steps would still change of ranges, m
+    remainder: FloatArray  # (points,), what further steps would still change of ranges, m
     # what the surfaces left unexplained when they were found, as a fraction of the signal
     reference: float
     # of the frames, where the shot shows light that no surface explains; ranges as measured
@@ -212,7 +212,7 @@ def _measure_blur(solver: AmplitudeSolver) -> AmplitudeSolver:
         blurred = model.blur(sigma_px)
         rest = blurred.image - blurred.render(amplitude)
         scale, none = scale_amplitude(blurred, amplitude > 0), np.zeros_like(amplitude)
-        change = explain_by_amplitude(blurred, rest, none, scale, FREE_ITERATIONS)
+        change = explain_by_amplitude(blurred, rest, none, scale, FURTHER_FREE_ITERATIONS)
         rest -= blurred.render(change)
         return float(np.sum(model.weights * rest**2, dtype=np.float64))
 
@@ -227,6 +227,8 @@ def _measure_blur(solver: AmplitudeSolver) -> AmplitudeSolver:
         about = slice(best - 1, best + 2)
         curve = np.polynomial.Polynomial.fit(np.array(BLURS_PX[about]), np.array(misfits[about]), 2)
         sigma_px = float(curve.deriv().roots()[0])
+    if sigma_px == model.blur_px:
+        return solver
     if find_misfit(sigma_px) > LEAST_BLURRED * find_misfit(model.blur_px):
         return solver
     blurred = AmplitudeSolver(model.blur(sigma_px), amplitude, solver.weight, solver)
@@ -265,7 +267,7 @@ def follow_surfaces(
         state = replace(model.state, coefficients=shapes, shading=even)
         model, limit = model.lay_out(masks, [p.basis for p in patches], state), MAX_UNEXPLAINED
         solver = AmplitudeSolver(model, amplitude, weight)
-        remainder = np.zeros(len(patches))
+        remainder = np.zeros(model.surface.size)
         begun = begun.cover(model)
     solver.run(FOLLOWING_ITERATIONS)
     # what explains the last shot best without the prior has that shot's noise
@@ -329,7 +331,7 @@ def _refine(
     most: int = MAX_REFINEMENTS,
 ) -> tuple[Refinement, FloatArray]:
     """Steps on ranges and instrument until they hardly move; the last one, and what more would
-    change of each surface.
+    change of each point's range.
     """
     model, moved = solver.model, np.zeros(solver.amplitude.size)
     for number in range(most):
@@ -353,7 +355,7 @@ def _refine(
     # where a surface is dark, it may go anywhere
     light = solver.amplitude + np.float32(TINY)
     remainder = [extrapolate_step(moved[p], earlier[p], light[p]) for p in model.parts]
-    return found, np.array(remainder)
+    return found, np.concatenate(remainder)
 
 
 def _measure_step(
@@ -403,12 +405,12 @@ def settle_surfaces(
     solver.amplitude[own] = apart.amplitude
 
 
-def extrapolate_step(last: FloatArray, earlier: FloatArray, light: Image) -> float:
-    """Return how far the steps of a surface would still go, root mean square over its light, if each leads on as
-    the last did from the one before: the sum of a geometric series. All (points,).
+def extrapolate_step(last: FloatArray, earlier: FloatArray, light: Image) -> FloatArray:
+    """Return how far the steps of a surface would still lead each point, if each leads on as the last did from the
+    one before: the sum of a geometric series. All (points,).
     """
     ratio = min(max(_lead_on(last, earlier, light), 0.0), MOST_ONWARD)
-    return float(np.sqrt(np.average(last**2, weights=light))) * ratio / (1 - ratio)
+    return np.abs(last) * (ratio / (1 - ratio))
 
 
 def _lead_on(last: FloatArray, earlier: FloatArray, light: Image) -> float:

@@ -38,7 +38,7 @@ BY_Y[[0, 1, 2], [2, 4, 5]] = 1, 1, 2
 LIMB = 0.44
 LIMB_LEVELS = np.array([1.0, 1.5, 2.0, 3.0, 5.0])
 # Of robust fits: each only has to be nearer than the one before, whose errors it weighs by.
-FIT_ROUNDS, FIT_STEPS, FIT_TOLERANCE = 5, 30, 1e-3
+FIT_ROUNDS, FIT_STEPS, FIT_TOLERANCE = 3, 30, 1e-3
 FITTED_RETURNS = 500  # of nine unknowns, evenly chosen: with more a start is no better
 
 

@@ -17,6 +17,7 @@ from tofclip.recovery.surfaces.shapes import QuadricBasis
 # Of the greatest need to be bent of all surfaces, or of a need that leaves no doubt: those that need it
 # more are bent.
 CERTAINLY_BENT, NO_DOUBT = 3.0, 100.0
+ROUND_NEED = 0.5
 # Of a surface's usual brightness: the shape of what is dimmer says nothing of it.
 ROUND_FRACTION = 0.3
 
@@ -69,7 +70,7 @@ def _round_splines(
     before = refine_state(ahead, solver.amplitude, replace(found, steps=0))
     shapes = {surface: ahead.find_quadric(own) for surface, own in points.items()}
     trial, after, needed = _try_shapes(solver, ahead, before, shapes)
-    better = {surface: shape for surface, shape in shapes.items() if needed[surface] <= 0}
+    better = {surface: shape for surface, shape in shapes.items() if needed[surface] <= ROUND_NEED}
     if 0 < len(better) < len(shapes):
         trial, after, _ = _try_shapes(solver, ahead, before, better)
     if better:
