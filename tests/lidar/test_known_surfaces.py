@@ -49,6 +49,8 @@ def test_dim_and_small_things_are_seen_beside_bright_ones(
     assert score["median_mm"] < 2.8
     # a pixel of the steep plate spans 27 mm of range; 0.4 mm, and 2.2 if each had one time
     assert score["medians_mm"].get("steep plate", 0) < 0.8
+    # a wire is round: 0.2 mm, and 0.4 if its sides were as near as its middle
+    assert score["medians_mm"].get("wire", 0) < 0.3
     returns = frames.returns
     # surfaces' points and frames' returns are one list: pixel by pixel, nearest first
     pixel = returns.y.astype(int) * 64 + returns.x
@@ -141,8 +143,8 @@ def test_leaves_are_kept_in_little_light():
 
 @pytest.mark.nightly
 def test_a_blur_along_the_slit_hardly_displaces_a_ball():
-    """As of a streak tube: each place has light of other ranges. 0.11 was missed, 0.009 false, and the ball
-    8.1 mm off; now 0.019, 0 and 5.3 mm, far more than it says, as the blur is measured once.
+    """As of a streak tube: each place has light of other ranges, and before they are known a part of the blur is
+    taken for a pulse that is longer. 0.11 was missed, and the ball 8.1 mm off; 0 and 1.0 mm, 0.7 times what it says.
     """
     things = [
         sphere("ball", (0.1, 0.1, 2.6), 0.2, 0.6),
@@ -150,9 +152,10 @@ def test_a_blur_along_the_slit_hardly_displaces_a_ball():
     ]
     shot = make_shot(things, seed=2, size=48, blur=1.5)
     _, score = recover_shot(shot, shot.true_camera)
-    assert score["miss"] < 0.03
+    assert score["miss"] < 0.01
     assert score["false"] < 0.005
-    assert score["medians_mm"]["ball"] < 5.5
+    assert score["medians_mm"]["ball"] < 2
+    assert score["z"]["ball"] < 1.5
 
 
 def test_light_of_a_floor_that_is_not_found_is_told():

@@ -30,7 +30,12 @@ from tofclip.recovery.surfaces.ranges import (
     measure_local_shifts,
     refine_state,
 )
-from tofclip.recovery.surfaces.returns import estimate_displacement, list_returns
+from tofclip.recovery.surfaces.returns import (
+    ROD_RADIUS_PX,
+    estimate_displacement,
+    list_returns,
+    round_rod,
+)
 from tofclip.recovery.surfaces.shapes import QuadricBasis, SmoothBasis, evaluate_monomials
 from tofclip.recovery.surfaces.straighten import straighten_surfaces
 from tofclip.shots import Frames
@@ -516,6 +521,24 @@ def test_the_objective_holds_what_is_known_of_surfaces_beforehand(shot):
     expected = sum(float(one @ known @ one) / 2 for one in bent.coefficients)
     rest = refine_state(model, amplitude).rest
     assert compute_objective(model, rest) == pytest.approx(expected, rel=0.01)
+
+
+def test_pixels_at_the_side_of_a_rod_see_it_farther_away():
+    """Of one of radius R the mean depth that a pixel sees, less the mean over all its light."""
+    y, x = np.indices((40, 5)).reshape(2, -1)
+    inside = np.linspace(-1, 1, 100_001)[1:-1]  # places across it, radii
+    depth = ROD_RADIUS_PX * (1 - np.sqrt(1 - inside**2))
+    pixel = np.rint(ROD_RADIUS_PX * inside + 2)
+    light = np.sqrt(1 - inside**2)  # of what faces the camera less and less
+    seen = np.array([depth[pixel == one].mean() for one in (1, 2, 3)])
+    bright = np.array([0, *(light[pixel == one].sum() for one in (1, 2, 3)), 0])
+    found = round_rod(y + 7, x + 3, bright[x])
+    line = np.average(depth, weights=light)
+    np.testing.assert_allclose(
+        found.reshape(40, 5)[:, 1:4], np.tile(seen - line, (40, 1)), atol=1e-3
+    )
+    # what is as wide as pixels shows its own shape
+    assert not round_rod(y, x, np.ones(y.size)).any()
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ SHIFT_SHOWN = 1 / 3
 # radius if its light is within such a distance of its axis, root mean square: that of what is seen as a line;
 # and by how much of a pixel's width, root mean square, its points are off: those of rods of 10 and 12 mm, whose
 # radii are 0.3 to 0.8 px, by 0.05 to 0.1.
-ROD_FRACTION, ROD_RADIUS_PX, ROD_SPREAD_PX, ROD_PX = 0.1, 0.6, 1.0, 0.06
+ROD_FRACTION, ROD_RADIUS_PX, ROD_SPREAD_PX, ROD_PX = 0.1, 0.6, 1.3, 0.06
 # Of a pixel, root mean square, light lies higher or lower than where it is put: views tell rows only by how
 # their lines lean. Tables that are turned are off by 0.02 to 0.05 of what a pixel spans.
 ROW_ERROR_PX = 0.02
