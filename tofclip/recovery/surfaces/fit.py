@@ -78,7 +78,7 @@ CHANGED_EXCESS = 0.02  # beyond `CHANGED_RATIO` of what surfaces left unexplaine
 
 # Standard deviations of a blur along the slit, px, that are tried until one explains the shot less well than
 # the one before; what has to be left of the misfit with the one that was known (0.3 of a shot of 2000 photons,
-# 0.96 of the recorded scene5; 0.997 of one that is not blurred, of leaves); how often it is measured anew.
+# 0.97 of the recorded scene5; 0.997 of one that is not blurred, of leaves); how often it is measured anew.
 BLURS_PX, LEAST_BLURRED, BLUR_ROUNDS = (0.0, 0.7, 1.0, 1.3, 1.6, 2.0, 2.5, 3.0), 0.985, 4
 
 
@@ -153,7 +153,7 @@ def _fit_returns(
     # 5. Ranges.
     solver, refinement, remainder = _fit_ranges(begun, darkness, tick)
     for _ in range(BLUR_ROUNDS if solver.model.blur_px else 0):
-        # what returns of frames were off by hid a part of the blur
+        # what ranges of frames' returns were off by had hidden a part of the blur
         better = _measure_blur(solver)
         if better is solver:
             break

@@ -54,7 +54,7 @@ SWEEP_DOUBT, PULL_SIGMAS = 0.1, 2.0
 CENTRE_SIGMA_PX, DISPLACEMENT_SIGMA_PX = 0.3, 1e-3
 # Of the brightness behind another surface, between the views: less does not matter, or is noise.
 MIN_SHADING, SHADING_SIGMAS = 0.1, 3.0
-MOST_SHADING = 3.0  # what hardly anything shows may be thought to be as dark, or bright
+MOST_SHADING = 3.0  # steps on what has hardly any light may lead anywhere
 # Of conjugate gradients. Smooth changes of amplitude, which matter for a derivative, converge first,
 # and those of the last step are nearly right.
 ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 6, 2

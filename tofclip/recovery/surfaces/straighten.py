@@ -17,6 +17,8 @@ from tofclip.recovery.surfaces.shapes import QuadricBasis
 # Of the greatest need to be bent of all surfaces, or of a need that leaves no doubt: those that need it
 # more are bent.
 CERTAINLY_BENT, NO_DOUBT = 3.0, 100.0
+# Of what the freedom is worth that surfaces of second order lack: splines whose freedom is needed more stay
+# (0.13 of a melon whose returns are displaced).
 ROUND_NEED = 0.5
 # Of a surface's usual brightness: the shape of what is dimmer says nothing of it.
 ROUND_FRACTION = 0.3
