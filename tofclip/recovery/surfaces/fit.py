@@ -22,7 +22,6 @@ from tofclip.recovery.surfaces.amplitudes import (
     START_ITERATIONS,
     AmplitudeSolver,
     Tick,
-    explain_by_amplitude,
     scale_amplitude,
 )
 from tofclip.recovery.surfaces.extents import grow_surfaces, join_surfaces, keep_lit, take_apart
@@ -36,7 +35,12 @@ from tofclip.recovery.surfaces.pulse import (
     Image,
     measure_pulse,
 )
-from tofclip.recovery.surfaces.ranges import FURTHER_FREE_ITERATIONS, Refinement, refine_state
+from tofclip.recovery.surfaces.ranges import (
+    FURTHER_FREE_ITERATIONS,
+    Refinement,
+    explain_rest,
+    refine_state,
+)
 from tofclip.recovery.surfaces.start import (
     CHANGED_RATIO,
     DIM,
@@ -210,10 +214,9 @@ def _measure_blur(solver: AmplitudeSolver) -> AmplitudeSolver:
 
     def find_misfit(sigma_px: float) -> float:
         blurred = model.blur(sigma_px)
-        rest = blurred.image - blurred.render(amplitude)
-        scale, none = scale_amplitude(blurred, amplitude > 0), np.zeros_like(amplitude)
-        change = explain_by_amplitude(blurred, rest, none, scale, FURTHER_FREE_ITERATIONS)
-        rest -= blurred.render(change)
+        error, none = blurred.image - blurred.render(amplitude), np.zeros_like(amplitude)
+        scale = scale_amplitude(blurred, amplitude > 0)
+        _, rest = explain_rest(blurred, error, none, scale, FURTHER_FREE_ITERATIONS)
         return float(np.sum(model.weights * rest**2, dtype=np.float64))
 
     misfits: list[float] = []

@@ -172,7 +172,7 @@ class SurfaceModel(SurfacePoints):
         longer.image, around = (
             scipy.ndimage.gaussian_filter1d(one, sigma, axis=0) for one in (image, variance)
         )
-        # the variance of a mean of independent measurements is so many times less
+        # variance of one measurement over that of a weighted mean of independent ones
         averaged = np.float32(2 * np.sqrt(np.pi) * sigma)
         longer.weights = valid * averaged / np.maximum(around, TINY)
         return longer

@@ -352,7 +352,7 @@ def refine_state(
     if earlier is not None and earlier.free is not None:
         excess = np.where(scale > 0, earlier.free - amplitude, np.float32(0))
         iterations = FURTHER_FREE_ITERATIONS
-    excess, rest = _explain_rest(model, error, excess, scale, iterations)
+    excess, rest = explain_rest(model, error, excess, scale, iterations)
 
     # 2. As long as ranges are off by much, late views would take a part of it: ranges go first.
     groups = [
@@ -411,7 +411,7 @@ def _take_step(
     step that is far too long may overflow: it is refused like others that lower nothing.
     """
     state, (error, excess, scale) = model.state, begun
-    settled, rest = _explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
+    settled, rest = explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
     before = compute_objective(model, rest)
     ranges = "coefficients", "patterns", "shading"
     owners = np.array([one if name in ranges else len(model.parts) for name, one, _ in names])
@@ -421,7 +421,7 @@ def _take_step(
             parts = np.array(PARTS)[tries]
             ahead = _move(model, state, amplitude, names, parts[owners] * newton, changes)
             light = model.render(ahead)
-            change, left = _explain_rest(
+            change, left = explain_rest(
                 model, model.image - light, excess, scale, MOVED_FREE_ITERATIONS
             )
             if compute_objective(model, left) < before + SAYS_NOTHING:
@@ -458,7 +458,7 @@ def delay_light(model: SurfaceModel) -> SurfaceModel:
     return apart
 
 
-def _explain_rest(
+def explain_rest(
     model: SurfaceModel, error: Image, change: Image, scale: Image, iterations: int
 ) -> tuple[Image, Image]:
     """The change of amplitude that explains a misfit best, begun at `change`, and what is left."""

@@ -92,7 +92,6 @@ def list_returns(
             depth[rod] = pixel_m * round_rod(y[own], x[own], light)
             rounded[rod] = ROD_PX * pixel_m
     distance = distance + depth
-    time = 2 * distance / SPEED_OF_LIGHT
     hidden = estimate_hidden_shift(model, amplitude)
     parts = np.stack([fitted, fit.remainder, *moved, bent, rounded, hidden])
     deviation = np.sqrt(np.sum(parts**2, axis=0) + model.estimate_sweep_error() ** 2)
@@ -103,7 +102,7 @@ def list_returns(
         intensity=intensity[chosen].astype(np.float32),
         confidence=deviation[chosen].astype(np.float32),
         return_number=np.ones(y.size, np.uint8),
-        time=time[chosen],
+        time=2 * distance[chosen] / SPEED_OF_LIGHT,
         camera=camera,
         false_alarm=doubt[strong],
     ).merge(others)
@@ -115,7 +114,8 @@ def round_rod(y: Pixels, x: Pixels, light: FloatArray) -> FloatArray:
     pixels is taken to be round, and pixels at its sides see these. `light`: of the pixels, by which its axis, a
     parabola, is found; (n,).
     """
-    place = np.stack([x, y], axis=1) - np.average(np.stack([x, y], axis=1), axis=0, weights=light)
+    place = np.stack([x, y], axis=1).astype(np.float64)
+    place -= np.average(place, axis=0, weights=light)
     _, axes = np.linalg.eigh(place.T @ (place * light[:, np.newaxis]))
     across, along = (place @ axes).T
     course, root = np.vander(along, 3), np.sqrt(light)
@@ -124,8 +124,8 @@ def round_rod(y: Pixels, x: Pixels, light: FloatArray) -> FloatArray:
         return np.zeros(light.size)
     # from its axis to its limb, the part that each pixel sees, as wide as a pixel looks from there
     reach = np.abs(axes[:, 0]).sum() / 2
-    ends = np.array([aside - reach, aside + reach]) / ROD_RADIUS_PX
-    near, far = np.clip(ends[0], -1, 0.9), np.clip(ends[1], -0.9, 1)
+    near = np.clip((aside - reach) / ROD_RADIUS_PX, -1, 0.9)
+    far = np.clip((aside + reach) / ROD_RADIUS_PX, -0.9, 1)
     area = (
         far * np.sqrt(1 - far**2) + np.arcsin(far) - near * np.sqrt(1 - near**2) - np.arcsin(near)
     )
