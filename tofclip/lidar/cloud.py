@@ -1,5 +1,4 @@
-"""Point clouds: where in space each return came from; and clouds cleaned, thinned, measured and laid over
-each other, by Open3D where it loads (normals, planes, registration), else by SciPy.
+"""Point clouds: where in space each return came from; and clouds cleaned, thinned and measured.
 
 Organised clouds have one point for each pixel of the picture, row by row, NaN where nothing came
 back: programs that work on neighbours take these from the rows and columns.
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IndexArray
 from tofclip.camera.model import compute_slopes
@@ -184,15 +183,15 @@ class PointCloud(Storable):
 
     def to_open3d(self) -> Any:
         """Return an `open3d.geometry.PointCloud`: the positions, and the intensity as colours; see
-        `to_open3d_tensor` for one with all columns. `MissingDependencyError` where Open3D is not
-        installed, or does not load.
+        `to_open3d_tensor` for one with all columns. Open3D has what is not here, such as normals and
+        registration. `MissingDependencyError` where it is not installed, or does not load.
         """
         return self.to_open3d_tensor().to_legacy()
 
     def to_open3d_tensor(self) -> Any:
         """Return an `open3d.t.geometry.PointCloud`: positions, the intensity as colours, and every
-        other column as an attribute (points, 1), such as ``.point["range_sigma"]``;
-        `MissingDependencyError` as `to_open3d`.
+        other column as an attribute (points, 1), such as ``.point["range_sigma"]``, which
+        `from_open3d` takes back from a cloud that was moved; `MissingDependencyError` as `to_open3d`.
         """
         tensors = import_open3d()
         shown = tensors.t.geometry.PointCloud(tensors.core.Tensor(self.xyz))
@@ -390,29 +389,6 @@ class Plane:
     rms: float  # root mean square distance of these from it, m
 
 
-@dataclass(frozen=True)
-class Alignment:
-    """How one cloud is laid over another."""
-
-    pose: FloatArray  # (4, 4), rotation and translation (m) that takes the source to the target
-    overlap: float  # share of the source's points with a neighbour in the target
-    rms: float  # root mean square distance to these neighbours, m
-
-
-def transform_cloud(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
-    """Return a cloud in another frame, such as that of a mount or of a map; ranges stay those from
-    the camera. `pose` (4, 4): extrinsics: rotation and translation (m) from the camera's frame to
-    the other.
-    """
-    matrix = np.asarray(pose, dtype=np.float64)
-    if matrix.shape != (4, 4):
-        raise ShapeError("a pose", (4, 4), matrix.shape)
-    turn = matrix[:3, :3]
-    if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) and np.linalg.det(turn) > 0):
-        raise InputError("a pose must be a rotation and a translation, without scale or mirror")
-    return replace(cloud, xyz=(cloud.xyz @ turn.T + matrix[:3, 3]).astype(np.float32))
-
-
 def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     """Return one point for each occupied cube of side `voxel`, m: means of its points. Deviations
     of independent points shrink with their number; the return number is the least.
@@ -435,11 +411,6 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     columns["return_number"] = first
     columns["xyz"] = np.stack([mean(axis) for axis in cloud.xyz.T], axis=-1)
     return replace(cloud, **columns)
-
-
-def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0) -> PointCloud:
-    """Leave out what `find_outliers` finds."""
-    return cloud[~find_outliers(cloud, neighbours, deviations)]
 
 
 def find_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0) -> BoolArray:
@@ -471,17 +442,6 @@ def find_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4
     return ratio > limit
 
 
-def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
-    """Return each point's normal, (n, 3), towards the camera, by three neighbours or more."""
-    if len(cloud) < 3 or neighbours < 3:
-        raise InputError("a normal needs at least three points and three neighbours")
-    open3d = import_open3d()
-    shape = cloud.to_open3d()
-    shape.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(neighbours))
-    shape.orient_normals_towards_camera_location(np.zeros(3))
-    return np.asarray(shape.normals)
-
-
 def fit_plane(cloud: PointCloud, reach: float, seed: int = 0) -> Plane:
     """Find the plane with most points within `reach`, m, by random sampling, and fit it to them."""
     if len(cloud) < 3 or not reach > 0:
@@ -497,25 +457,6 @@ def fit_plane(cloud: PointCloud, reach: float, seed: int = 0) -> Plane:
     normal *= -1 if normal @ middle > 0 else 1
     rms = float(np.sqrt(np.mean(((points - middle) @ normal) ** 2)))
     return Plane(normal, float(normal @ middle), inliers, rms)
-
-
-def align_clouds(
-    source: PointCloud, target: PointCloud, reach: float, start: ArrayLike | None = None
-) -> Alignment:
-    """Lay a cloud over another one, such as the next of a sequence (point-to-plane iterated closest
-    points). `reach`: largest distance of points that may belong together, m; `start` (4, 4): first
-    guess.
-    """
-    if min(len(source), len(target)) < 3 or not reach > 0:
-        raise InputError("registration needs three points in each cloud and a positive reach")
-    open3d, surface = import_open3d(), target.to_open3d()
-    surface.normals = open3d.utility.Vector3dVector(estimate_normals(target))
-    registration = open3d.pipelines.registration
-    first = np.eye(4) if start is None else np.asarray(start, dtype=np.float64)
-    to_planes = registration.TransformationEstimationPointToPlane()
-    found = registration.registration_icp(source.to_open3d(), surface, reach, first, to_planes)
-    pose = np.asarray(found.transformation)
-    return Alignment(pose, float(found.fitness), float(found.inlier_rmse))
 
 
 @dataclass(frozen=True)
