@@ -19,7 +19,6 @@ from tofclip.camera.registration import (
     find_sharpest_shears,
     fit_parallax_to_centres,
     fit_parallax_to_shears,
-    measure_sharpness,
 )
 from tofclip.errors import CalibrationError, FileFormatError, InputError
 from tofclip.storage import Record
@@ -267,12 +266,7 @@ def test_numbers_that_give_no_parallax_are_refused(attempt, message):
         attempt()
 
 
-def test_sharpness_counts_how_few_pixels_hold_the_light():
-    picture = np.zeros((1, 8, 8), np.float32)
-    assert measure_sharpness(picture) == 0
-    assert measure_sharpness(picture + 1) == pytest.approx(1)
-    picture[0, 2:4, 2:4] = 5
-    assert measure_sharpness(picture) == pytest.approx(16)
+def test_shears_of_a_dark_shot_have_no_weight():
     curve = find_sharpest_shears(DARK, optical(), [slice(0, 4)], [-1.0, 0.0, 1.0])
     assert not curve.agreement.any()
     assert not curve.weight.any()

@@ -21,5 +21,4 @@ from .registration import estimate_skew as estimate_skew
 from .registration import find_sharpest_shears as find_sharpest_shears
 from .registration import fit_parallax_to_centres as fit_parallax_to_centres
 from .registration import fit_parallax_to_shears as fit_parallax_to_shears
-from .registration import measure_sharpness as measure_sharpness
 from .registration import register_views as register_views

@@ -449,17 +449,6 @@ def find_sharpest_shears(
     return _fit_focus_curve(table, tried, light)
 
 
-def measure_sharpness(frames: Float32Array) -> float:
-    """Mean square over squared mean of the `frames`, weighted by light; 0 without light."""
-    flat = frames.reshape(frames.shape[0], -1)
-    light = flat.sum(axis=1, dtype=np.float64)
-    square = np.einsum("tp,tp->t", flat, flat, dtype=np.float64)
-    lit = light > 0
-    if not lit.any():
-        return 0.0
-    return float(np.average(square[lit] * flat.shape[1] / light[lit] ** 2, weights=light[lit]))
-
-
 def _fit_focus_curve(table: FloatArray, tried: FloatArray, light: FloatArray) -> FocusCurve:
     """Vertex of the parabola through each maximum and its neighbours."""
     rows = np.arange(table.shape[0])
