@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import AnyArray, BoolArray, Float32Array, FloatArray
 from tofclip.lidar import PointCloud
-from tofclip.lidar.cloud import OPTIONAL_COLUMNS
-from tofclip.units import SPEED_OF_LIGHT
+from tofclip.lidar.cloud import complete_cloud
 
 if TYPE_CHECKING:
     from nlos.export import Mesh
@@ -167,18 +166,11 @@ class Source(abc.ABC):
 
 def make_cloud(xyz: AnyArray, known: Mapping[str, AnyArray] | None = None) -> PointCloud:
     """Make a cloud of positions (n, 3), m; what is not known follows from them, or is 0."""
-    known, distance = known or {}, np.linalg.norm(xyz, axis=1)
-    nothing = np.zeros(len(distance), np.float32)
-    columns: dict[str, Any] = {
-        "intensity": known.get("intensity", known.get("brightness", nothing)),
-        # Files of earlier versions call it confidence.
-        "range_sigma": known.get("range_sigma", known.get("confidence", nothing)),
-        "range": known.get("range", distance),
-        "return_number": known.get("return_number", np.ones(len(distance), np.uint8)),
-        "time": known.get("time", 2 * distance / SPEED_OF_LIGHT),  # light travels the range twice
-        **{name: known[name] for name in OPTIONAL_COLUMNS if name in known},
-    }
-    return PointCloud(xyz=xyz, **columns)
+    known, nothing = known or {}, np.zeros(len(xyz), np.float32)
+    # Files of earlier versions call it confidence.
+    also_called = {"intensity": "brightness", "range_sigma": "confidence"}
+    found = {name: known.get(other, nothing) for name, other in also_called.items()}
+    return complete_cloud(xyz, {**found, **known})
 
 
 BESIDE_HINT = "moved to the right by this many widths of the first layer"

@@ -251,7 +251,7 @@ NEEDED = {
     "matplotlib": ("matplotlib", RECOVER),
     "numba": ("numba", RECOVER),
     "numpy": ("numpy", "info {files}/camera.h5"),
-    # it fits planes and finds normals, in Python only
+    # it fits planes, in Python and on the page
     "open3d": (None, "cloud {frames} --out {new}/scene.ply --drop-outliers"),
     "OpenEXR": ("OpenEXR", "cloud {frames} --out {new}/depth.exr"),
     "pyfftw": (None, "info {files}/camera.h5"),  # images: tests/nlos
