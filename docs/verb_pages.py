@@ -17,11 +17,6 @@ COMPLETION_NOTE = """\
 and names of methods with the tab key; `tofclip --show-completion` only shows what it would install."""
 
 
-def collect_verbs() -> dict[str, TyperCommand]:
-    """Return every verb that computes, by the words that call it, such as ``lidar scene``."""
-    return walk_verbs()
-
-
 def write_pages(folder: Path) -> list[Path]:
     """Write a Markdown page for each verb, and one that lists them.
 
@@ -38,7 +33,7 @@ def write_pages(folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     pages = {
         f"{name.replace(' ', '-')}.md": render_page(name, command)
-        for name, command in collect_verbs().items()
+        for name, command in walk_verbs().items()
     }
     pages["index.md"] = _render_index(list(pages))
     for old in folder.glob("*.md"):

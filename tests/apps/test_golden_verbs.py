@@ -15,10 +15,10 @@ import pytest
 import typer
 from small_instrument import DEEP_CAMERA as CAMERA
 from small_instrument import Shell, write_views
-from verb_pages import collect_verbs
 
 from apps.benchmarks import harness
 from apps.benchmarks.harness import find_cases
+from apps.cli import walk_verbs
 from apps.viewer.page import Page
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_checkerboard
@@ -26,7 +26,7 @@ from tofclip.simulate.patterns import make_checkerboard
 pytestmark = pytest.mark.xdist_group("golden")
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "verbs.txt"
-VERBS = collect_verbs()
+VERBS = walk_verbs()
 NOT_RUN = {"warm-up": "compiles every loop of the program; test_program holds its keys"}
 """Verbs whose keys are not recorded, and why."""
 

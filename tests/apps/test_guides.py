@@ -22,9 +22,9 @@ from guides import (
     run_guide,
 )
 from PIL import Image
-from verb_pages import collect_verbs
 
 import tofclip
+from apps.cli import walk_verbs
 from apps.figures.style import store_picture
 from devices import aravis
 from nlos import backprojection
@@ -85,7 +85,7 @@ def test_what_a_guide_shows_and_cannot_run(guide, tmp_path, monkeypatch):
 
 def read_command(command):
     """Whether a command is one of this program; what it names is made, as it has to be there."""
-    known, words = collect_verbs(), shlex.split(command)[1:]
+    known, words = walk_verbs(), shlex.split(command)[1:]
     for word in words:
         if not word.startswith("-") and "/" not in word:
             Path(word).touch()
@@ -235,7 +235,7 @@ class TestReadme:
             words = shlex.split(command)[1:]
             # This demonstration is run for its figures: here its words are read.
             if words[:2] == ["nlos", "demo"]:
-                with collect_verbs()["nlos demo"].make_context("demo", words[2:]):
+                with walk_verbs()["nlos demo"].make_context("demo", words[2:]):
                     continue
             # Smaller pictures than a reader's: it is the words that count.
             small = {"sim+remoteex://?seed=1": "sim+remoteex://?seed=1&scene=small"}

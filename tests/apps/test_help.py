@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 import typer
-from verb_pages import collect_verbs, write_pages
+from verb_pages import write_pages
 
 import tofclip
-from apps.cli import COMPLETION_VARIABLE, VERB_OVERVIEW, split_docstring, wrap_command
+from apps.cli import COMPLETION_VARIABLE, VERB_OVERVIEW, split_docstring, walk_verbs, wrap_command
 from apps.studies.report import find_studies
 
 ROOT = Path(tofclip.__file__).parents[1]
-VERBS = collect_verbs()
+VERBS = walk_verbs()
 
 
 @pytest.mark.parametrize("name", VERBS)

@@ -8,9 +8,8 @@ import h5py
 import numpy as np
 import pytest
 from small_instrument import HIDDEN_POINT, HIDDEN_SCENE
-from verb_pages import collect_verbs
 
-from apps.cli import split_docstring
+from apps.cli import split_docstring, walk_verbs
 from nlos import Capture, Grid, Volume
 from nlos.analysis import find_sampling_step
 from nlos.export import Mesh
@@ -219,7 +218,7 @@ def test_surfaces_are_traced_with_normals(shell, capture, source):
 
 @pytest.mark.nightly
 def test_the_examples_run_one_after_the_other(shell):
-    verbs = collect_verbs()
+    verbs = walk_verbs()
     for verb in ("simulate", "info", "reconstruct", "film", "compare"):
         for example in split_docstring(verbs[f"nlos {verb}"].callback.__doc__)[1]:
             outcome = shell(shlex.join(shlex.split(example)[1:]))

@@ -15,7 +15,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from verb_pages import collect_verbs
 
 import tofclip
 from apps import cli
@@ -26,7 +25,7 @@ from tofclip.files import describe_missing_package
 PROGRAM = [sys.executable, "-m", "tofclip"]
 ROOT = Path(tofclip.__file__).parents[1]
 LONGEST_WAIT_S = 120.0  # compiling the kernels on a slow, cold machine
-VERBS = collect_verbs()
+VERBS = cli.walk_verbs()
 
 
 def start(command, folder=ROOT, path=ROOT, **environment):
