@@ -27,7 +27,6 @@ from tofclip.recovery.surfaces.ranges import (
     Refinement,
     compute_objective,
     iterate_derivatives,
-    measure_local_shifts,
     refine_state,
 )
 from tofclip.recovery.surfaces.returns import (
@@ -37,6 +36,7 @@ from tofclip.recovery.surfaces.returns import (
     round_rod,
 )
 from tofclip.recovery.surfaces.shapes import QuadricBasis, SmoothBasis, evaluate_monomials
+from tofclip.recovery.surfaces.shifts import follow_local_shifts, measure_local_shifts
 from tofclip.recovery.surfaces.straighten import straighten_surfaces
 from tofclip.shots import Frames
 from tofclip.simulate import simulate_shot
@@ -266,6 +266,28 @@ def test_light_that_arrives_elsewhere_than_its_surface_shows_by_how_much():
     moved, still = shifts[model.parts[0]], shifts[model.parts[1]]
     assert np.median(moved) == pytest.approx(away, rel=0.2)
     assert np.median(still) < 0.1 * away
+
+
+def test_ranges_follow_what_no_function_of_the_surface_does():
+    """The right half of a plate is rendered a millimetre farther, a third of a row; the surface is a plane. Few
+    iterations, which noise does not follow, lead two thirds of the way.
+    """
+    model = make_model(simulate_shot(SCENE, INSTRUMENT, seed=0).streak)
+    amplitude, away = np.full(model.surface.size, 500, np.float32), 1e-3
+    plate, beside = model.masks
+    right = plate & (np.arange(SHAPE[1]) > np.median(model.column[model.parts[0]]))
+    farther = replace_farther(model.state, away).coefficients[0]
+    shapes = [model.state.coefficients[0], farther, model.state.coefficients[1]]
+    bases = [model.bases[number] for number in (0, 0, 1)]
+    shading = np.zeros((3, CAMERA.views))
+    state = replace(model.state, coefficients=shapes, shading=shading)
+    truth = model.lay_out(np.stack([plate & ~right, right, beside]), bases, state)
+    model.image = truth.render(amplitude)
+    rest, usual = model.image - model.render(amplitude), np.full(amplitude.size, away)
+    shifts = follow_local_shifts(AmplitudeSolver(model, amplitude, 0.0), rest, usual)
+    moved = right[model.row, model.column] & (model.surface == 0)
+    assert 0.5 * away < np.median(shifts[moved]) < 1.1 * away
+    assert np.median(np.abs(shifts[~moved])) < 0.01 * away
 
 
 def replace_farther(state: SurfaceState, away: float) -> SurfaceState:

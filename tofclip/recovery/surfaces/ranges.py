@@ -16,7 +16,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
@@ -63,8 +62,6 @@ ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 6, 2
 FREE_ITERATIONS, FURTHER_FREE_ITERATIONS, MOVED_FREE_ITERATIONS = 15, 6, 3
 # By which the middle of a part of a pixel is off from where `fill_partly` puts it, root mean square.
 LEFT_ASIDE_PX = 0.2
-# Of local shifts: the side of the square that moves together, and the least that is known of one.
-LOCAL_PX, LEAST_INFORMATION = 5, 1.0
 
 Unknown = tuple[str, int, int]
 RIDGE = 1e-6  # of each unknown's own information: for what the shot says nothing about
@@ -464,40 +461,6 @@ def explain_rest(
     """The change of amplitude that explains a misfit best, begun at `change`, and what is left."""
     change = explain_by_amplitude(model, error, change, scale, iterations)
     return change, error - model.render(change)
-
-
-def measure_local_shifts(model: SurfaceModel, amplitude: Image, rest: Image) -> FloatArray:
-    """Return by how much the light of each point and of those about it arrives later, (points,), m,
-    root mean square, than on its surface: what the surface's functions do not follow, as at the rim of
-    a ball. A pulse's width is the most that a shift of light shows.
-
-    Noise and what else the model does not explain is another in each view, a range is the same in all:
-    products of different views' shifts are on average the shift's square, whatever the misfit's size.
-    """
-    apart, moved = delay_light(model), amplitude * np.float32(1 / model.row_m)
-    pull = np.array(apart.gather_views(model.weights * rest)) * moved
-    known = np.array(apart.gather_views(model.weights * apart.render(moved))) * moved
-    most, shifts = (model.pulse.sigma * model.row_m) ** 2, np.zeros(amplitude.size)
-    for part, mask in zip(model.parts, model.masks, strict=True):
-        pictures = np.zeros((2, len(pull), *mask.shape))
-        pictures[:, :, mask] = pull[:, part], known[:, part]
-        sums = LOCAL_PX**2 * scipy.ndimage.uniform_filter(
-            pictures, LOCAL_PX, mode="constant", axes=(2, 3)
-        )
-        products, sure = (one.sum(0) ** 2 - (one**2).sum(0) for one in sums[:, :, mask])
-        sure = np.maximum(sure, LEAST_INFORMATION)
-        squares = sums[0][:, mask] ** 2
-        noise = 2 * (squares.sum(0) ** 2 - (squares**2).sum(0))  # of products, if there is no shift
-        # what all of the surface shows, and of what a place shows beyond it as much as is no noise
-        # (empirical Bayes)
-        total = max(float(sure.sum()), LEAST_INFORMATION)
-        usual = max(float(products.sum()) / total, 0.0)
-        usual += LOCAL_PX * float(np.sqrt(noise.sum())) / total
-        beyond = products - usual * sure
-        spread = max(np.sum(beyond**2 - noise), 0.0)
-        own = usual + spread * sure * beyond / (spread * sure**2 + noise * np.sum(sure**2) + TINY)
-        shifts[part] = np.sqrt(np.clip(own, 0, most))
-    return shifts
 
 
 def _leave_out_even_shading(

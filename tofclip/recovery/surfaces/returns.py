@@ -20,8 +20,8 @@ from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.others import NEAR_BINS, find_near
 from tofclip.recovery.surfaces.patches import rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
-from tofclip.recovery.surfaces.ranges import measure_local_shifts
 from tofclip.recovery.surfaces.shapes import TINY, Pixels
+from tofclip.recovery.surfaces.shifts import follow_local_shifts, measure_local_shifts
 from tofclip.shots import Returns
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
@@ -81,6 +81,7 @@ def list_returns(
     moved = displaced[:, np.newaxis] * model.compute_slopes()
     rest = model.image - fit.whole.model.render(fit.whole.amplitude)
     bent = measure_local_shifts(model, amplitude, rest) / SHIFT_SHOWN
+    distance = distance + follow_local_shifts(fit.solver, rest, bent)
     y, x = model.row[chosen], model.column[chosen]
     depth, rounded = np.zeros((2, distance.size))
     for surface in np.unique(model.surface[chosen]):
