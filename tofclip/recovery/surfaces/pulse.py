@@ -23,7 +23,7 @@ REACH_BEFORE, REACH_AFTER = 2.0, 14.0  # camera's pulse widths: what is looked a
 SHOWN = 15_000  # lit measurements, of evenly chosen columns, say as much of a few dozen lags as all
 COURSE_RIDGE = 1e-4  # of a lag's own information
 # Times the camera's width: what is nearer the fit finds itself
-NARROW, WIDE = 0.67, 1.5
+NARROW, WIDE = 0.9, 1.1
 TAIL_START = 1.5  # camera's pulse widths after the return
 # Of the pulse's light, and of what a pulse without it leaves unexplained: a tail that is less may be
 # light of surfaces that are off, or missing (0.4 in few photons; tails 0.5 to 1.1).
