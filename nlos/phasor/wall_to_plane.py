@@ -284,13 +284,14 @@ class LowRankTransfer:
         every = int(NODE_OVERSAMPLING)
         lateral = np.maximum(transfer.nodes[::every], 0)[:, np.newaxis]
         weights = np.sqrt(lateral * (lateral <= lateral_limits)) * strength
-        coarse, weights = table[:, ::every], weights.astype(np.float32)
+        coarse = table[:, ::every]
 
         def decompose(group: slice) -> tuple[FloatArray, ComplexArray]:
             weighted = coarse[..., group] * weights[:, group]
             flat = weighted.reshape(len(weighted), -1)
+            # in double precision: of all energy as little as 2.5e-9 may be left out
             values, vectors = np.linalg.eigh(flat.conj() @ flat.T)
-            return np.maximum(values, 0).astype(np.float64), vectors
+            return np.maximum(values, 0), vectors.astype(np.complex64)
 
         energies = list(map_parallel(decompose, groups, len(groups)))
         ordered = np.sort(np.concatenate([values for values, _ in energies]))
@@ -356,24 +357,25 @@ def _find_distance_basis(
 def count_nodes(
     wavenumbers: FloatArray, strength: FloatArray, middle: float, half: float, error: float
 ) -> int:
-    """Return how many Chebyshev nodes of the distance interpolate waves to a relative error.
+    """Return how many Chebyshev nodes of the distance interpolate waves to a relative error, at
+    whatever distances points are.
 
     Enough for the phase, which runs through ``k * half`` about its middle (Jacobi-Anger expansion),
     and for the fall with distance, which is singular at distance 0.
 
-    `middle, half`: middle and half width of the range of distances, m; `error`: relative.
+    `strength` (frequencies,): amplitude of each, of any scale; `middle, half`: middle and half
+    width of the range of distances, m; `error`: relative.
     """
     from scipy.special import jv
 
-    # Strong frequencies decide, and neighbours hardly differ.
-    some = slice(None, None, max(1, wavenumbers.size // 16))
     carrier = CARRIER_FRACTION * wavenumbers[-1]
-    phases = half * np.maximum(carrier, wavenumbers[some] - carrier)
-    orders = np.arange(4, 24 + int(1.5 * phases.max()))
-    rest = 2 * np.abs(jv(orders, phases[:, np.newaxis])) * strength[some, np.newaxis]
-    # five beyond the last coefficient that counts: the expansion falls faster than exponentially
-    # from there
-    phase = int(np.flatnonzero(rest.max(axis=0) > error).max(initial=-1)) + 5
+    phases = half * np.maximum(carrier, wavenumbers - carrier)
+    orders = np.arange(24 + int(1.5 * phases.max()))
+    # a coefficient, 2 J_n, that has no node is missing, and nodes take it for another one's
+    coefficients = 4 * np.abs(jv(orders, phases[:, np.newaxis]))
+    rest = np.cumsum(coefficients[:, ::-1], axis=1)[:, ::-1]
+    relative = strength / np.linalg.norm(strength)
+    phase = int(np.argmax(np.linalg.norm(rest * relative[:, np.newaxis], axis=0) <= error))
     # 1 / R is singular at R = 0: Chebyshev coefficients fall like exp(-n arccosh(middle / half))
     # (Bernstein ellipse)
     fall = np.arccosh(middle / half)
