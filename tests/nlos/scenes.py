@@ -73,9 +73,7 @@ def see(
 
 def see_shaped(shape, count, laser=SHAPED_SPOT):
     """Four hidden points seen from a wall of 2 m x 2 m."""
-    return see(
-        SHAPED_POINTS, build_relay_wall(shape, count), laser, SHAPED_AXIS, SHAPED_JITTER
-    )
+    return see(SHAPED_POINTS, build_relay_wall(shape, count), laser, SHAPED_AXIS, SHAPED_JITTER)
 
 
 def around(point, half=0.12, voxel=0.04):

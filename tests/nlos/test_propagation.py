@@ -121,6 +121,8 @@ def list_clouds():
     """Points, planes and tolerances; the first on a lattice, which may repeat its spectrum."""
     for shape in WALLS:
         yield from ((points_of(shape), plane, TOLERANCES) for plane in (FITTING, OTHER))
+    # Waves that fade are still there.
+    yield points_of("planar"), Plane(OTHER.x, OTHER.y, 0.05), TOLERANCES
     sparse, coarse = Plane(FITTING.x[::4], FITTING.y[::3], FITTING.z), points_of("wavy", 11)
     # Points up to two wavelengths apart, on either side.
     yield from ((coarse, FITTING, (1e-2,)), (coarse, sparse, (1e-2,)))
@@ -154,6 +156,11 @@ def test_it_is_the_direct_sum_within_the_tolerance(number):
         found = propagate_low_rank(make_plan(points, plane, tolerance), values)
         assert found.dtype == np.complex64
         assert relative_error(found, exact) < tolerance
+
+
+def test_a_plane_nearer_than_half_a_step_of_the_wall_is_reached_directly(always):
+    wall = WallBeforePlane.of(points_of("planar"), Plane(OTHER.x, OTHER.y, 0.45 * STEP))
+    assert plan_transforms(wall, WAVES, BAND.weights, 1e-2) is None
 
 
 def test_silence_and_a_single_frequency_pass(always):
