@@ -220,6 +220,9 @@ def _fit_spacing(widest: float, axis: FloatArray) -> float:
 # noise and even backgrounds, which come by all paths alike; errors of 1e-2 and 1e-3 ask for 0.7 and
 # 1.0.
 WALL_FRACTION_PER_DIGIT = 0.35
+# And beyond the farthest crossing of a straight way, where voxels are close, of the longest path: an
+# error of 1e-2 asks for 0.2 to 0.25.
+CROSSING_FRACTION_PER_DIGIT = 0.125
 # Of the fade towards the plane's rim, how wide a rim carries too little to be told from an image of
 # it a period away: at most, and how much less for each digit of the tolerance. Measured with noise;
 # none where the error is 1e-3.
@@ -258,12 +261,13 @@ class StraightPaths:
         # farthest voxels from the foremost points soonest.
         before = (plane.z - low[2]) / (first - low[2])
         behind = (last - plane.z) / (last - high[2])
-        room = WALL_FRACTION_PER_DIGIT * np.log10(1 / tolerance)
-        rim = RIM_FRACTION + RIM_FRACTION_PER_DIGIT * np.log10(tolerance)
+        digits = np.log10(1 / tolerance)
+        reach = before + CROSSING_FRACTION_PER_DIGIT * digits
+        rim = RIM_FRACTION - RIM_FRACTION_PER_DIGIT * digits
         rim = np.clip(rim, 0, MAX_RIM_FRACTION)
         fade_y, fade_x = plane.fade
         return cls(
-            float(max(before, room) * longest),
+            float(max(reach, WALL_FRACTION_PER_DIGIT * digits) * longest),
             float(behind * longest),
             (float(rim * fade_y), float(rim * fade_x)),
             first,

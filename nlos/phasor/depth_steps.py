@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 
 from nlos.method import require_memory
 from nlos.phasor.transfer import (
-    FINE_NODE_OVERSAMPLING,
-    FINE_NODES_TOLERANCE,
-    NODE_OVERSAMPLING,
     Offsets,
     SphericalWaves,
     TransferFunction,
     Window,
+    choose_oversampling,
     find_fast_length,
     find_lateral_limits,
     find_min_periods,
@@ -211,8 +209,7 @@ class DiffractionPlan:
     @cached_property
     def transfer(self) -> TransferFunction:
         """Transfer functions from the plane to any depth."""
-        fine, widest = self.tolerance < FINE_NODES_TOLERANCE, self.plane_waves.lateral_limits[-1]
-        density = FINE_NODE_OVERSAMPLING if fine else NODE_OVERSAMPLING
+        widest, density = self.plane_waves.lateral_limits[-1], choose_oversampling(self.tolerance)
         waves, window = self.waves, self._window
         return TransferFunction(waves, window, float(widest), self._min_distance, density)
 

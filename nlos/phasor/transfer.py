@@ -135,9 +135,14 @@ def find_fast_length(count: float) -> int:
 # by 3e-5.
 NODE_OVERSAMPLING, FINE_NODE_OVERSAMPLING = 2.5, 3.5
 # Relative error allowed, below which nodes are finer.
-FINE_NODES_TOLERANCE = 5e-4
+FINE_NODES_TOLERANCE = 1e-3
 # Samples along the radius per period of the fastest product of wave and Bessel function.
 RADII_PER_PERIOD = 1.25
+
+
+def choose_oversampling(tolerance: float) -> float:
+    """Return how close nodes have to be for a relative error."""
+    return FINE_NODE_OVERSAMPLING if tolerance < FINE_NODES_TOLERANCE else NODE_OVERSAMPLING
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +207,11 @@ class TransferFunction:
         smooth waves. A trapezoidal rule in t with ``rho = h * log(1 + exp(t))``: evenly spaced but
         for a few ever smaller radii.
         """
-        fastest = self.waves.max_wavenumber + self.max_lateral_wavenumber
-        # the fastest phase along the radius is that of wave and Bessel function together
-        h = min(2 * np.pi / (fastest * RADII_PER_PERIOD), self.min_distance)
+        # the fastest phase along the radius is that of wave and Bessel function together; and waves
+        # that fade along z, with q far beyond k, are sampled as others are
+        widest = self.max_lateral_wavenumber
+        fastest = RADII_PER_PERIOD * (self.waves.max_wavenumber + widest)
+        h = min(2 * np.pi / max(fastest, 2 * widest), self.min_distance)
         t = np.arange(-8.0, self.window.outer_radius / h + 1)
         radii = h * np.logaddexp(0, t)
         return radii, 2 * np.pi * radii * h / (1 + np.exp(-t))
@@ -259,7 +266,12 @@ ENERGY_OVERSAMPLING = 1.25
 
 
 def find_lateral_limits(
-    waves: SphericalWaves, window: Window, strength: FloatArray, distance: float, error: float
+    waves: SphericalWaves,
+    window: Window,
+    strength: FloatArray,
+    distance: float,
+    error: float,
+    fading: bool = False,
 ) -> FloatArray:
     """Return the largest lateral wavenumber that counts at each frequency, rad/m, increasing.
 
@@ -269,11 +281,13 @@ def find_lateral_limits(
     weak, and evanescent ones.
 
     `strength` (frequencies,): relative amplitude of each frequency; `distance`: from the sources,
-    along z, m; `error`: allowed, root mean square, relative.
+    along z, m; `error`: allowed, root mean square, relative; `fading`: whether waves that fade over
+    the distance, but not to the error, may count, too.
     """
     # of the window's fall only, not of where it is cut: that lies beyond all targets
     whole = window.without_cut
-    beyond = waves.max_wavenumber + whole.spectral_spread(error)
+    decay = np.log(1 / error) / abs(distance) if fading else 0.0
+    beyond = np.hypot(waves.max_wavenumber, decay) + whole.spectral_spread(error)
     points = replace(waves, continued=False)
     transfer = TransferFunction(points, whole, beyond, abs(distance), ENERGY_OVERSAMPLING)
     first = TAPS // 2  # the node at 0

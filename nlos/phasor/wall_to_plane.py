@@ -16,11 +16,11 @@ import numpy as np
 from nlos.phasor.fourier import FourierPlan, allocate_zeros, plan_transform
 from nlos.phasor.to_depths_kernels import transpose
 from nlos.phasor.transfer import (
-    NODE_OVERSAMPLING,
     Offsets,
     SphericalWaves,
     TransferFunction,
     Window,
+    choose_oversampling,
     find_fast_length,
     find_lateral_limits,
     find_min_periods,
@@ -56,9 +56,10 @@ MIN_FOURIER_TOLERANCE = 5e-4
 PREPARATION_S, TERM_S, LATTICE_POINT_S, DIRECT_TERM_S = 0.02, 2e-5, 3e-9, 2e-10
 # The same per term for a scattered wall point and for a plane wave of it.
 POINT_S, WAVE_S = 2.5e-8, 9e-9
-# Of the error allowed, what weak plane waves that are left out may hold: most of it passes beside
-# all voxels, or is on the edge of the window. Measured with noise.
-WAVES_ERROR_FRACTION = 1.5
+# Of the error allowed, what weak plane waves that are left out may hold: before voxels, where most
+# of it passes beside all of them, or is on the edge of the window, measured with noise; and on a
+# plane, which may hold all of it and, beside that, less of the rest than the window.
+VOXEL_WAVES_ERROR_FRACTION, PLANE_WAVES_ERROR_FRACTION = 1.5, 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,16 +164,23 @@ def plan_transforms(
     # what fades before the nearest voxels is not wanted on the plane either
     first = plane.z if paths is None else paths.first_depth
     ahead = first - float(points[:, 2].max())
-    limits = find_lateral_limits(waves, window, strength, ahead, WAVES_ERROR_FRACTION * tolerance)
+    # So near before a wall more waves that fade count than Fourier transforms are quick at.
+    if ahead < axis_step(wall.x) / 2:
+        return None
+    fraction = PLANE_WAVES_ERROR_FRACTION if paths is None else VOXEL_WAVES_ERROR_FRACTION
+    limits = find_lateral_limits(
+        waves, window, strength, ahead, fraction * tolerance, fading=paths is None
+    )
     rows, columns = (int(limits[-1] / step) for step in steps)
-    seconds = TERM_S + LATTICE_POINT_S * high * wide
+    seconds = TERM_S + LATTICE_POINT_S * max(high * wide, 4 * rows * columns)
     if geometry.lattice is None:
         seconds = TERM_S + POINT_S * len(points) + WAVE_S * 4 * rows * columns
     if not is_faster_than_direct(geometry, waves, tolerance, seconds):
         return None
     distances = plane.z - points[:, 2]
     finest = max(float(distances.min()), axis_step(wall.x) / 2)
-    transfer = TransferFunction(waves, window, float(limits[-1]), finest)
+    density = choose_oversampling(tolerance)
+    transfer = TransferFunction(waves, window, float(limits[-1]), finest, density)
     lateral = np.hypot(
         steps[1] * np.arange(columns + 1)[:, np.newaxis], steps[0] * np.arange(rows + 1)
     )
@@ -281,16 +289,17 @@ class LowRankTransfer:
         table: ComplexArray = flat.reshape(-1, *samples.shape[1:])
         # Energies need no nodes so close. A ring of lateral wavenumbers holds waves in proportion
         # to its radius.
-        every = int(NODE_OVERSAMPLING)
+        every = int(transfer.oversampling)
         lateral = np.maximum(transfer.nodes[::every], 0)[:, np.newaxis]
         weights = np.sqrt(lateral * (lateral <= lateral_limits)) * strength
-        coarse, weights = table[:, ::every], weights.astype(np.float32)
+        coarse = table[:, ::every]
 
         def decompose(group: slice) -> tuple[FloatArray, ComplexArray]:
             weighted = coarse[..., group] * weights[:, group]
             flat = weighted.reshape(len(weighted), -1)
+            # in double precision: of all energy as little as 2.5e-9 may be left out
             values, vectors = np.linalg.eigh(flat.conj() @ flat.T)
-            return np.maximum(values, 0).astype(np.float64), vectors
+            return np.maximum(values, 0), vectors.astype(np.complex64)
 
         energies = list(map_parallel(decompose, groups, len(groups)))
         ordered = np.sort(np.concatenate([values for values, _ in energies]))
@@ -356,24 +365,25 @@ def _find_distance_basis(
 def count_nodes(
     wavenumbers: FloatArray, strength: FloatArray, middle: float, half: float, error: float
 ) -> int:
-    """Return how many Chebyshev nodes of the distance interpolate waves to a relative error.
+    """Return how many Chebyshev nodes of the distance interpolate waves to a relative error, at
+    whatever distances points are.
 
     Enough for the phase, which runs through ``k * half`` about its middle (Jacobi-Anger expansion),
     and for the fall with distance, which is singular at distance 0.
 
-    `middle, half`: middle and half width of the range of distances, m; `error`: relative.
+    `strength` (frequencies,): amplitude of each, of any scale; `middle, half`: middle and half
+    width of the range of distances, m; `error`: relative.
     """
     from scipy.special import jv
 
-    # Strong frequencies decide, and neighbours hardly differ.
-    some = slice(None, None, max(1, wavenumbers.size // 16))
     carrier = CARRIER_FRACTION * wavenumbers[-1]
-    phases = half * np.maximum(carrier, wavenumbers[some] - carrier)
-    orders = np.arange(4, 24 + int(1.5 * phases.max()))
-    rest = 2 * np.abs(jv(orders, phases[:, np.newaxis])) * strength[some, np.newaxis]
-    # five beyond the last coefficient that counts: the expansion falls faster than exponentially
-    # from there
-    phase = int(np.flatnonzero(rest.max(axis=0) > error).max(initial=-1)) + 5
+    phases = half * np.maximum(carrier, wavenumbers - carrier)
+    orders = np.arange(24 + int(1.5 * phases.max()))
+    # a coefficient, 2 J_n, that has no node is missing, and nodes take it for another one's
+    coefficients = 4 * np.abs(jv(orders, phases[:, np.newaxis]))
+    rest = np.cumsum(coefficients[:, ::-1], axis=1)[:, ::-1]
+    relative = strength / np.linalg.norm(strength)
+    phase = int(np.argmax(np.linalg.norm(rest * relative[:, np.newaxis], axis=0) <= error))
     # 1 / R is singular at R = 0: Chebyshev coefficients fall like exp(-n arccosh(middle / half))
     # (Bernstein ellipse)
     fall = np.arccosh(middle / half)

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from nlos import Grid
 from nlos.capture import TimeAxis
-from nlos.simulate import PointScene
+from nlos.simulate import PointScene, build_relay_wall
 from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
 
@@ -20,7 +20,6 @@ THREE_POINTS = (HIDDEN, (-0.2, 0.1, 0.75), (0.05, -0.05, 0.5))
 SPOTS = np.array([[0.12, 0.05, 0.0], [-0.3, 0.2, 0.0]])
 
 # Before walls of 2 m x 2 m.
-SHAPES = ("planar", "cylinder", "wavy", "relief", "plates")
 SHAPED_SPOT = np.array([0.1, 0.05, 0.02])
 SHAPED_POINTS = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4], [-0.6, -0.6, 1.1]])
 SHAPED_JITTER, SHAPED_AXIS = 60e-12, TimeAxis(512, 32e-12)
@@ -52,24 +51,6 @@ def curved_wall(rows=17, columns=21):
     return wall
 
 
-def shaped_wall(shape, count):
-    """A wall of 2 m x 2 m: planar, a cylinder of radius 2.5 m, waves of 0.1 m, relief of 0.3 m, or
-    two plates.
-    """
-    x, y = np.meshgrid(np.linspace(-1, 1, count), np.linspace(-1, 1, count))
-    depths = {
-        "planar": 0 * x,
-        "cylinder": 2.5 - np.sqrt(2.5**2 - x**2),
-        "wavy": 0.1 * np.sin(5 * x) * np.cos(4 * y),
-        "relief": 0.15 * (1 + np.sin(3 * x + 1) * np.cos(2 * y)),
-        "plates": np.where(x < 0, 0.0, 0.15),
-    }
-    wall = np.stack([x, y, depths[shape]], axis=-1)
-    if shape == "plates":
-        wall[np.abs(x) < 0.15] = np.nan
-    return wall
-
-
 def see(
     points,
     wall,
@@ -92,7 +73,7 @@ def see(
 
 def see_shaped(shape, count, laser=SHAPED_SPOT):
     """Four hidden points seen from a wall of 2 m x 2 m."""
-    return see(SHAPED_POINTS, shaped_wall(shape, count), laser, SHAPED_AXIS, SHAPED_JITTER)
+    return see(SHAPED_POINTS, build_relay_wall(shape, count), laser, SHAPED_AXIS, SHAPED_JITTER)
 
 
 def around(point, half=0.12, voxel=0.04):

@@ -18,7 +18,6 @@ from scenes import (
     SHAPED_JITTER,
     SHAPED_POINTS,
     SHAPED_SPOT,
-    SHAPES,
     SPOTS,
     THREE_POINTS,
     UNEVEN_DEPTHS,
@@ -26,11 +25,11 @@ from scenes import (
     relative_error,
     see,
     see_shaped,
-    shaped_wall,
 )
 
 from nlos import Capture, Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
+from nlos.simulate import WALLS, build_relay_wall
 
 RSD, HYBRID = PlanarRSD(wavelength=0.125, cycles=3), Hybrid(wavelength=0.25, cycles=4.24)
 TOLERANCES = (1e-2, 1e-3)
@@ -64,7 +63,7 @@ def see_scan(wall, laser, bins=640, points=SHAPED_POINTS):
 def see_behind(shape, grid):
     """Two hidden points towards the corners of a grid."""
     hidden = [[grid.x[2], grid.y[-2], grid.z[0]], [grid.x[-1], grid.y[0], grid.z[1]]]
-    return see_scan(shaped_wall(shape, 32), SHAPED_SPOT, 700, hidden)
+    return see_scan(build_relay_wall(shape, 32), SHAPED_SPOT, 700, hidden)
 
 
 def list_cases():
@@ -82,10 +81,10 @@ def list_cases():
     row = Grid(UNEVEN_DEPTHS.x, UNEVEN_DEPTHS.y[3:4], UNEVEN_DEPTHS.z[3:4])
     for name, grid in (("a row", row), ("a voxel", Grid(UNEVEN_DEPTHS.x[9:10], row.y, row.z))):
         yield f"rsd, {name}", Case(RSD, lambda: see_planar(SPOTS[0]), grid, (1e-2,))
-    for shape in SHAPES:
+    for shape in WALLS:
         shaped = Case(HYBRID, lambda shape=shape: see_shaped(shape, 25), SHAPED)
         yield f"hybrid, {shape}", shaped
-    wavy, two = shaped_wall("wavy", 17), np.array([SHAPED_SPOT, [-0.4, 0.3, 0.0]])
+    wavy, two = build_relay_wall("wavy", 17), np.array([SHAPED_SPOT, [-0.4, 0.3, 0.0]])
     for name, laser in (("confocal", "confocal"), ("two spots", two)):
         scan = Case(HYBRID, lambda laser=laser: see_scan(wavy, laser), SHAPED, (1e-2,))
         yield f"hybrid, {name}", scan
@@ -102,7 +101,7 @@ def list_cases():
     # wavelength is little more than two wall points.
     rim = lambda: see(  # noqa: E731
         0.5 * SHAPED_POINTS,
-        0.5 * shaped_wall("planar", 32),
+        0.5 * build_relay_wall("planar", 32),
         0.5 * SHAPED_SPOT,
         TimeAxis(300, 32e-12),
         SHAPED_JITTER,

@@ -10,11 +10,9 @@ from scenes import (
     SHAPED_JITTER,
     SHAPED_POINTS,
     SHAPED_SPOT,
-    SHAPES,
     relative_error,
     see,
     see_shaped,
-    shaped_wall,
 )
 
 import nlos.phasor.propagate
@@ -30,6 +28,7 @@ from nlos.phasor.propagate import (
 from nlos.phasor.transfer import SphericalWaves
 from nlos.phasor.wall_to_plane import WallBeforePlane, plan_transforms
 from nlos.plane import Plane
+from nlos.simulate import WALLS, build_relay_wall
 
 PULSE = VirtualPulse(0.25, 4.24)
 BAND = Band(PULSE, TimeAxis(512, 32e-12))
@@ -40,6 +39,7 @@ STEP = 2 / 31  # of walls with 32 points along a side
 FITTING = Plane(STEP * np.arange(-20, 24), STEP * np.arange(-21, 18), 0.4)
 OTHER = Plane(np.linspace(-1.3, 1.1, 37), np.linspace(-0.8, 1.5, 29), 0.42)
 FINE = Plane(np.linspace(-1.2, 1.3, 40), np.linspace(-1.1, 1.0, 33), 0.4)
+TOLERANCES = (1e-2, 3e-3, 1e-3, 5e-4)
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def definition(capture, plane=PLANE):
     return np.einsum("yxpk,pk->yxk", waves, phasors)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("shape", WALLS)
 def test_the_spectral_field_is_the_definition(shape):
     capture = see_shaped(shape, 17)
     field = propagate(capture, PLANE, PULSE)
@@ -79,7 +79,7 @@ def test_confocal_waves_run_at_doubled_wavenumbers():
 
 def error_in_time(shape, count, laser, bin_width):
     axis = TimeAxis(round(512 * 32e-12 / bin_width), bin_width)
-    capture = see([[0.2, 0.1, 1.0]], shaped_wall(shape, count), laser, axis, SHAPED_JITTER)
+    capture = see([[0.2, 0.1, 1.0]], build_relay_wall(shape, count), laser, axis, SHAPED_JITTER)
     return relative_error(propagate(capture, PLANE, PULSE, "time").values, definition(capture))
 
 
@@ -106,7 +106,7 @@ def phasors(count):
 
 
 def points_of(shape, count=32):
-    wall = shaped_wall(shape, count)
+    wall = build_relay_wall(shape, count)
     return wall[np.isfinite(wall).all(axis=-1)]
 
 
@@ -119,8 +119,10 @@ def make_plan(points, plane, tolerance, strength=BAND.weights):
 
 def list_clouds():
     """Points, planes and tolerances; the first on a lattice, which may repeat its spectrum."""
-    for shape in SHAPES:
-        yield from ((points_of(shape), plane, (1e-2, 1e-3)) for plane in (FITTING, OTHER))
+    for shape in WALLS:
+        yield from ((points_of(shape), plane, TOLERANCES) for plane in (FITTING, OTHER))
+    # Waves that fade are still there.
+    yield points_of("planar"), Plane(OTHER.x, OTHER.y, 0.05), TOLERANCES
     sparse, coarse = Plane(FITTING.x[::4], FITTING.y[::3], FITTING.z), points_of("wavy", 11)
     # Points up to two wavelengths apart, on either side.
     yield from ((coarse, FITTING, (1e-2,)), (coarse, sparse, (1e-2,)))
@@ -154,6 +156,11 @@ def test_it_is_the_direct_sum_within_the_tolerance(number):
         found = propagate_low_rank(make_plan(points, plane, tolerance), values)
         assert found.dtype == np.complex64
         assert relative_error(found, exact) < tolerance
+
+
+def test_a_plane_nearer_than_half_a_step_of_the_wall_is_reached_directly(always):
+    wall = WallBeforePlane.of(points_of("planar"), Plane(OTHER.x, OTHER.y, 0.45 * STEP))
+    assert plan_transforms(wall, WAVES, BAND.weights, 1e-2) is None
 
 
 def test_silence_and_a_single_frequency_pass(always):
