@@ -11,10 +11,10 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
+from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, scale_amplitude
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import TINY, Image
-from tofclip.recovery.surfaces.ranges import delay_light
+from tofclip.recovery.surfaces.ranges import MOVED_FREE_ITERATIONS, delay_light, explain_rest
 
 # Of local shifts: the side of the square that moves together, and the least that is known of one.
 LOCAL_PX, LEAST_INFORMATION = 5, 1.0
@@ -82,5 +82,8 @@ def follow_local_shifts(solver: AmplitudeSolver, rest: Image, shifts: FloatArray
         return unknown + pull(image)
 
     product = scipy.sparse.linalg.LinearOperator((2 * light.size,) * 2, multiply, dtype=np.float32)
-    found, _ = scipy.sparse.linalg.cg(product, pull(rest), maxiter=LOCAL_ITERATIONS)
+    # what the prior took from amplitudes is not late
+    scale = scale_amplitude(model, light > 0)
+    _, late = explain_rest(model, rest, np.zeros_like(light), scale, MOVED_FREE_ITERATIONS)
+    found, _ = scipy.sparse.linalg.cg(product, pull(late), maxiter=LOCAL_ITERATIONS)
     return np.asarray(spread(usual * found[: light.size]))
