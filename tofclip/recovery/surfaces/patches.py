@@ -298,16 +298,15 @@ def _bend_where_needed(patch: Patch, bin_m: float) -> Patch:
     plain = patch.compute_error()
     if plain < BEND_BINS * bin_m:
         return patch
-    bent = None
+    tried: list[Patch] = []
     if patch.pixels.size >= MIN_ROUND_PX:
         inverse = patch.ray_length.ravel()[patch.pixels] / patch.distance
         basis, coefficients = fit_quadric(patch.pixels, inverse, patch.basis.image_shape)
-        bent = replace(patch, basis=basis, coefficients=coefficients)
-    if bent is None or bent.compute_error() >= CREASE_BINS * bin_m:
-        splines = _give_splines(patch)
-        # free as splines are, they follow a ball's returns better than the ball, where these are displaced
-        if bent is None or splines.compute_error() <= bent.compute_error():
-            bent = splines
+        tried = [replace(patch, basis=basis, coefficients=coefficients)]
+    # free as splines are, they follow a ball's returns better than the ball, where these are displaced
+    if not tried or tried[0].compute_error() >= CREASE_BINS * bin_m:
+        tried = [_give_splines(patch), *tried]
+    bent = min(tried, key=Patch.compute_error)
     return bent if bent.compute_error() < BENT_FRACTION * plain else patch
 
 

@@ -56,14 +56,17 @@ def measure_local_shifts(model: SurfaceModel, amplitude: Image, rest: Image) -> 
     return shifts
 
 
-def follow_local_shifts(solver: AmplitudeSolver, rest: Image, shifts: FloatArray) -> FloatArray:
+def follow_local_shifts(
+    solver: AmplitudeSolver, rest: Image, variance: Image, shifts: FloatArray
+) -> FloatArray:
     """Return by how much farther each point is than on its surface, (points,), m, as the light that is left of
     a shot, `rest`, shows: with ranges of LOCAL_PX pixels that move together, usually by `shifts`, (points,), m, and
-    with amplitudes, the shot is explained best (the mean of a Gaussian process).
+    with amplitudes, the shot is explained best (the mean of a Gaussian process). `variance`: of
+    `AmplitudeSolver.estimate_local_variance`.
     """
     model, light = solver.model, solver.amplitude
     apart, moved = delay_light(model), light * np.float32(1 / model.row_m)
-    weights = model.weights / solver.estimate_local_variance()
+    weights = model.weights / variance
     usual, fade = shifts.astype(np.float32), np.float32(LOCAL_FADE) * light
     mean = partial(scipy.ndimage.uniform_filter, size=LOCAL_PX, mode="constant")
 
