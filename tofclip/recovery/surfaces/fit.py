@@ -24,6 +24,7 @@ from tofclip.recovery.surfaces.amplitudes import (
     Tick,
     scale_amplitude,
 )
+from tofclip.recovery.surfaces.bodies import part_bodies
 from tofclip.recovery.surfaces.extents import grow_surfaces, join_surfaces, keep_lit, take_apart
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.others import find_others
@@ -61,7 +62,7 @@ from tofclip.solvers import Progress, ignore_progress
 from tofclip.threads import limit_blas_threads
 
 PULSE_ITERATIONS = 10  # of those at the start, before the pulse is measured
-MIN_REFINEMENTS, MAX_REFINEMENTS = 2, 6
+MIN_REFINEMENTS, MAX_REFINEMENTS = 2, 4  # steps on ranges, before surfaces are parted and after it
 # What dim light costs, in deviations, and for how many iterations at most, where it is to stay only as
 # the shot needs it: first it gives way, then what is needed comes back. Fewer after the first shot.
 SPARSELY, FOLLOWING_SPARSELY = ((4.0, 80), (2.0, 20)), ((4.0, 30), (2.0, 10))
@@ -182,19 +183,19 @@ def _fit_ranges(
     begun: AmplitudeSolver, darkness: float, tick: Tick = lambda: None
 ) -> tuple[AmplitudeSolver, Refinement, FloatArray]:
     """Fit ranges, and straighten splines that are not needed first: these take longer to be right, and late views
-    give way to them. `begun` stays as it is.
+    give way to them. Which surfaces are several shows once they are nearly right. `begun` stays as it is.
     """
     solver = AmplitudeSolver(copy.copy(begun.model), begun.amplitude, begun.weight, begun)
     solver.model.find_behind(solver.amplitude)
     solver, straightened = straighten_surfaces(solver)
     _approach_steep(solver, darkness)
-    refinement, remainder = _refine(solver, straightened, tick)
-    grown = grow_surfaces(solver)
+    refinement, _ = _refine(solver, straightened, tick, MIN_REFINEMENTS)
+    grown = grow_surfaces(part_bodies(solver))
     if grown is not solver:
         solver = keep_lit(grown)
+        refinement = refinement.cover(solver.model)
         _approach_steep(solver, darkness)
-        refinement, remainder = _refine(solver, refinement.cover(solver.model))
-    return solver, refinement, remainder
+    return solver, *_refine(solver, refinement, tick)
 
 
 def _measure_pulse(solver: AmplitudeSolver, least_tail: float = LEAST_TAIL) -> AmplitudeSolver:

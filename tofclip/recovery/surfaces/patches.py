@@ -57,9 +57,7 @@ KNOT_SPACING_PX, MAX_PIECES = 12, 8
 RETURNS_PER_UNKNOWN = 3.0  # of splines: they share their errors
 BEND_BINS = 0.3  # misfit of a quadratic from which on splines are tried
 BENT_FRACTION = 0.6  # of a quadratic's misfit: splines are worth their freedom below
-# Misfit from which on a patch may be two, also in its returns' deviations (0.67 are expected of a
-# surface's), and what is left of it where it is: with as much freedom again a ball alone has 0.5.
-CREASE_BINS, CREASE_SIGMAS, CREASE_FRACTION, CREASE_ROUNDS = 0.4, 0.67, 0.5, 8
+UNBENT_BINS = 0.4  # misfit of a bent patch from which on it may be something else
 MIN_ROUND_PX = 50  # of a surface of second order in space: any few returns lie on one
 EVIDENCE_ROUNDS = 2
 SPLINE_START_PENALTY, SPLINE_FLOOR = 1e-5, 1e-9  # per return, before the bending is known
@@ -80,6 +78,22 @@ class Patch:
     basis: SmoothBasis
     coefficients: FloatArray  # (size,), inverse depth, 1/m, over the basis
 
+    @classmethod
+    def fit(
+        cls,
+        pixels: Pixels,
+        distance: FloatArray,
+        deviation: FloatArray,
+        ray_length: FloatArray,
+        curvature_penalty: float = CURVATURE_PENALTY,
+    ) -> Patch:
+        """Return the patch of some returns, with a quadratic that is fitted robustly."""
+        basis = SmoothBasis((ray_length.shape[0], ray_length.shape[1]))
+        penalty = curvature_penalty * pixels.size * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+        inverse = ray_length.ravel()[pixels] / distance
+        coefficients, _ = _fit_robustly(basis.evaluate(pixels), inverse, penalty)
+        return cls(pixels, distance, deviation, ray_length, basis, coefficients)
+
     def compute_ranges(self, pixels: Pixels) -> FloatArray:
         """Return the ranges of the surface at some pixels, (n,)."""
         inverse = self.basis.compute_inverse(self.basis.evaluate(pixels), self.coefficients)
@@ -99,7 +113,7 @@ class Patch:
     def take(self, which: Any, penalty: float = CURVATURE_PENALTY) -> Patch:
         """Return the patch of some of the returns."""
         some = self.pixels[which], self.distance[which], self.deviation[which]
-        return _fit_quadratic(*some, self.ray_length, penalty)
+        return Patch.fit(*some, self.ray_length, penalty)
 
 
 def find_plain_patches(
@@ -114,7 +128,7 @@ def find_plain_patches(
     """
     if pixels.size == 0:
         return []
-    patches = _split(_fit_quadratic(pixels, distance, deviation, ray_length), bin_m)
+    patches = _split(Patch.fit(pixels, distance, deviation, ray_length), bin_m)
     patches.sort(key=lambda patch: -patch.pixels.size)
     before = len(patches) + 1
     while len(patches) < before:
@@ -129,13 +143,6 @@ def find_plain_patches(
     return sorted(patches, key=lambda patch: -patch.pixels.size)
 
 
-def bend_patches(patches: list[Patch], bin_m: float) -> list[Patch]:
-    """Bend plain patches where their returns are, and part them at creases; the largest first."""
-    bent = (_bend_where_needed(patch, bin_m) for patch in patches)
-    parts = [part for patch in bent for part in _part_at_creases(patch, bin_m)]
-    return sorted(parts, key=lambda part: -part.pixels.size)
-
-
 def _split(patch: Patch, bin_m: float) -> list[Patch]:
     """Return the connected parts of returns, and apart from these what touches them but lies on
     another surface: a ball on a table, a book that leans on it.
@@ -148,7 +155,7 @@ def _split(patch: Patch, bin_m: float) -> list[Patch]:
         far = _measure_distance(part, flat, bin_m) > 1
         if far.sum() >= MIN_DIMMER_PX and not far.all():
             # what splines follow is the rim of a round surface
-            whole = _bend_where_needed(part, bin_m)
+            whole = bend_where_needed(part, bin_m)
             if whole.compute_error() > BETWEEN_BINS * bin_m:
                 far = _measure_distance(part, _find_plane(part, flat, bin_m), bin_m) > 1
             large = [p for p in _split(part.take(far), bin_m) if p.pixels.size >= MIN_DIMMER_PX]
@@ -238,20 +245,6 @@ def rank_within_pixels(pixels: Pixels, distance: FloatArray) -> tuple[Pixels, Pi
     return order, number_returns(pixels[order]).astype(np.intp) - 1
 
 
-def _fit_quadratic(
-    pixels: Pixels,
-    distance: FloatArray,
-    deviation: FloatArray,
-    ray_length: FloatArray,
-    curvature_penalty: float = CURVATURE_PENALTY,
-) -> Patch:
-    basis = SmoothBasis((ray_length.shape[0], ray_length.shape[1]))
-    penalty = curvature_penalty * pixels.size * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-    inverse = ray_length.ravel()[pixels] / distance
-    coefficients, _ = _fit_robustly(basis.evaluate(pixels), inverse, penalty)
-    return Patch(pixels, distance, deviation, ray_length, basis, coefficients)
-
-
 def _fit_robustly(
     design: FloatArray, values: FloatArray, penalty: FloatArray
 ) -> tuple[FloatArray, float]:
@@ -282,7 +275,7 @@ def _merge(large: Patch, small: Patch, bin_m: float) -> Patch | None:
     pixels = np.concatenate([one.pixels for one in both])
     distance = np.concatenate([one.distance for one in both])
     deviation = np.concatenate([one.deviation for one in both])
-    joint = _fit_quadratic(pixels, distance, deviation, large.ray_length)
+    joint = Patch.fit(pixels, distance, deviation, large.ray_length)
     for one in both:
         # in little light returns scatter by more than that about a surface of their own
         least = max(MERGE_BINS * bin_m, MERGE_EXCESS * one.compute_error())
@@ -291,7 +284,7 @@ def _merge(large: Patch, small: Patch, bin_m: float) -> Patch | None:
     return joint
 
 
-def _bend_where_needed(patch: Patch, bin_m: float) -> Patch:
+def bend_where_needed(patch: Patch, bin_m: float) -> Patch:
     """Make a patch a surface of second order in space, or give it splines, whichever follows its
     returns better, where a quadratic does not follow them.
     """
@@ -304,75 +297,10 @@ def _bend_where_needed(patch: Patch, bin_m: float) -> Patch:
         basis, coefficients = fit_quadric(patch.pixels, inverse, patch.basis.image_shape)
         tried = [replace(patch, basis=basis, coefficients=coefficients)]
     # free as splines are, they follow a ball's returns better than the ball, where these are displaced
-    if not tried or tried[0].compute_error() >= CREASE_BINS * bin_m:
+    if not tried or tried[0].compute_error() >= UNBENT_BINS * bin_m:
         tried = [_give_splines(patch), *tried]
     bent = min(tried, key=Patch.compute_error)
     return bent if bent.compute_error() < BENT_FRACTION * plain else patch
-
-
-def _part_at_creases(patch: Patch, bin_m: float) -> list[Patch]:
-    """Return the parts of a patch, bent where needed as they are, where surfaces of their own follow the
-    returns of each far better: things that touch at one range, as a ball and the cable on which it hangs,
-    or two limbs; else the patch.
-    """
-    error = patch.compute_error()
-    if error < BEND_BINS * bin_m:
-        return [patch]
-    if len(pieces := _list_pieces(patch)) > 1:
-        bent = [_bend_where_needed(piece, bin_m) for piece in pieces]
-        off = [np.abs(one.compute_ranges(one.pixels) - one.distance) for one in bent]
-        if np.median(np.concatenate(off)) < BENT_FRACTION * error:
-            return [part for piece in bent for part in _part_at_creases(piece, bin_m)]
-    if error < CREASE_BINS * bin_m or patch.compute_misfit(patch) < CREASE_SIGMAS:
-        return [patch]
-    y, x = np.divmod(patch.pixels, patch.ray_length.shape[1])
-    best, least = None, CREASE_FRACTION * error
-    for across in (x, y, x + y, x - y):
-        second = _part_in_two(patch, across > np.median(across), SPLIT_BINS * bin_m)
-        if min(second.sum(), (~second).sum()) < MIN_PATCH_PX:
-            continue
-        parts = [_bend_where_needed(patch.take(own), bin_m) for own in (~second, second)]
-        sizes = [part.pixels.size for part in parts]
-        left = float(np.average([part.compute_error() for part in parts], weights=sizes))
-        if left < least:
-            best, least = parts, left
-    if best is None:
-        return [patch]
-    return [part for half in best for part in _part_at_creases(half, bin_m)]
-
-
-def _list_pieces(patch: Patch) -> list[Patch]:
-    """The pieces of a patch that nothing joins in the picture, as of a head and an arm of one range."""
-    seen = np.zeros(patch.ray_length.shape, bool)
-    seen.ravel()[patch.pixels] = True
-    piece = scipy.ndimage.label(seen, np.ones((3, 3)))[0].ravel()[patch.pixels]
-    large = np.flatnonzero(np.bincount(piece) >= MIN_PATCH_PX)
-    return [patch.take(piece == one) for one in large]
-
-
-def _part_in_two(patch: Patch, second: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
-    """Say which returns follow the second of two quadratics better, (n,), with those about them, from a
-    first guess on. No return counts for more than `most`, m.
-    """
-    for _ in range(CREASE_ROUNDS):
-        if min(second.sum(), (~second).sum()) < MIN_PATCH_PX:
-            break
-        fits = (patch.take(own).compute_ranges(patch.pixels) for own in (~second, second))
-        off = [
-            _add_up_beside(patch, np.minimum(np.abs(fit - patch.distance), most)) for fit in fits
-        ]
-        before, second = second, off[1] < off[0]
-        if (before == second).all():
-            break
-    return second
-
-
-def _add_up_beside(patch: Patch, values: FloatArray) -> FloatArray:
-    """Values of returns, (n,), added up over the pixels about each, on one scale."""
-    picture = np.bincount(patch.pixels, values, patch.ray_length.size)
-    picture = picture.reshape(patch.ray_length.shape)
-    total = scipy.ndimage.uniform_filter(picture, NEIGHBOURS_PX, mode="constant")
-    return np.asarray(total.ravel()[patch.pixels])
 
 
 def _give_splines(patch: Patch) -> Patch:
@@ -442,8 +370,8 @@ def _extend(
         _, nearest = np.unique(pixels[own], return_index=True)
         own = own[nearest]
         if own.size > size:
-            grown = _fit_quadratic(pixels[own], distance[own], deviation[own], patch.ray_length)
-    return patch if size < GROWTH * patch.pixels.size else _bend_where_needed(grown, bin_m)
+            grown = Patch.fit(pixels[own], distance[own], deviation[own], patch.ray_length)
+    return patch if size < GROWTH * patch.pixels.size else bend_where_needed(grown, bin_m)
 
 
 def find_dimmer_patches(
@@ -464,7 +392,7 @@ def find_dimmer_patches(
     for plain in find_plain_patches(pixel, distance, deviation, ray_length, bin_m):
         if plain.pixels.size < MIN_DIMMER_PX:
             break
-        patch = _bend_where_needed(plain, bin_m)
+        patch = bend_where_needed(plain, bin_m)
         own = np.isin(pixel, patch.pixels)
         own &= np.abs(distance - patch.compute_ranges(pixel)) < NEIGHBOUR_BINS * bin_m
         here = patch.compute_ranges(patch.pixels)

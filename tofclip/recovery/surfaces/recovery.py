@@ -14,7 +14,7 @@ from tofclip.errors import InputError
 from tofclip.lidar import Detection
 from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
 from tofclip.recovery.surfaces.amplitudes import REFINEMENT_ITERATIONS, START_ITERATIONS
-from tofclip.recovery.surfaces.fit import MAX_REFINEMENTS, fit_surfaces
+from tofclip.recovery.surfaces.fit import MAX_REFINEMENTS, MIN_REFINEMENTS, fit_surfaces
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS, Image
 from tofclip.recovery.surfaces.returns import list_returns
@@ -67,7 +67,8 @@ class SurfaceRecovery:
     @property
     def steps(self) -> int:
         """Iterations of FISTA at most."""
-        return 2 * START_ITERATIONS + MAX_REFINEMENTS * REFINEMENT_ITERATIONS + self.iterations
+        refinements = MIN_REFINEMENTS + MAX_REFINEMENTS
+        return 2 * START_ITERATIONS + refinements * REFINEMENT_ITERATIONS + self.iterations
 
     def work(self, frames: int) -> int:
         """Frame iterations that are reported at most: the start's, one per frame and iteration, and

@@ -21,7 +21,7 @@ from tofclip.recovery.surfaces.others import NEAR_BINS, find_near
 from tofclip.recovery.surfaces.patches import rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
 from tofclip.recovery.surfaces.shapes import TINY, Pixels
-from tofclip.recovery.surfaces.shifts import follow_local_shifts, measure_local_shifts
+from tofclip.recovery.surfaces.shifts import SHIFT_SHOWN, follow_local_shifts, measure_local_shifts
 from tofclip.shots import Returns
 from tofclip.threads import limit_blas_threads
 from tofclip.units import SPEED_OF_LIGHT
@@ -35,10 +35,6 @@ FALSE_ODDS = np.array([9.76, -0.99, -3.07, 2.35, -0.40, -1.64])
 # Less, and of light elsewhere more, makes no difference.
 LEAST_ELSEWHERE, MOST_ELSEWHERE, LEAST_PART, LEAST_BRIGHT = 0.07, 0.5, 0.02, 0.01
 ABOUT_PX = 5  # side of the square
-
-# Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
-# the rest. Medians over ten kinds of bent surfaces of known range are 0.13 to 0.75.
-SHIFT_SHOWN = 1 / 3
 
 # A surface that fills as little of the square over its length is a rod, whose roundness no pixel resolves; its
 # radius if its light is within such a distance of its axis, root mean square: that of what is seen as a line;

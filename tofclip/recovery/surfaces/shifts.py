@@ -18,6 +18,9 @@ from tofclip.recovery.surfaces.ranges import MOVED_FREE_ITERATIONS, delay_light,
 
 # Of local shifts: the side of the square that moves together, and the least that is known of one.
 LOCAL_PX, LEAST_INFORMATION = 5, 1.0
+# Of a surface's error at a place, what the light that is left there shows: neighbours' amplitudes take
+# the rest. Medians over ten kinds of bent surfaces of known range are 0.13 to 0.75.
+SHIFT_SHOWN = 1 / 3
 # By how much of it an amplitude may be off where a range is, and iterations of conjugate gradients.
 LOCAL_FADE, LOCAL_ITERATIONS = 0.5, 10
 

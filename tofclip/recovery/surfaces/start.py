@@ -16,11 +16,11 @@ from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar import compute_ray_directions, depth
 from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver
+from tofclip.recovery.surfaces.creases import bend_patches
 from tofclip.recovery.surfaces.model import SMOOTHING_PX, SurfaceModel, compare_smoothed
 from tofclip.recovery.surfaces.patches import (
     MARGIN_PX,
     Patch,
-    bend_patches,
     extend_patches,
     find_dimmer_patches,
     find_plain_patches,

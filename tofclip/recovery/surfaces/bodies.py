@@ -1,0 +1,163 @@
+"""Which surface is several, as the whole shot decides: bodies that touch at one range, which the returns of frames
+do not tell from one. Where they may part is looked for in ranges that follow the shot point by point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from tofclip.arrays import FloatArray
+from tofclip.recovery.surfaces.amplitudes import (
+    AGAINST_DIM,
+    REFINEMENT_ITERATIONS,
+    AmplitudeSolver,
+    share_misfit,
+)
+from tofclip.recovery.surfaces.creases import find_bodies
+from tofclip.recovery.surfaces.extents import LIT_SIGMAS, find_lit, take_apart
+from tofclip.recovery.surfaces.patches import Patch
+from tofclip.recovery.surfaces.pulse import Image
+from tofclip.recovery.surfaces.ranges import refine_state
+from tofclip.recovery.surfaces.shapes import TINY, SmoothBasis
+from tofclip.recovery.surfaces.shifts import SHIFT_SHOWN, follow_local_shifts, measure_local_shifts
+from tofclip.recovery.surfaces.start import measure_rays
+
+BODY_FRACTION = 0.3  # of a surface's usual brightness: ranges of what is dimmer say little
+FOLLOWED_BINS = 0.25  # ranges that follow the shot are as many bins off as those of frames are bins
+BODY_MARGIN_PX = 3  # how far one body may reach into the next
+# Steps until bodies are compared with what they were taken for, and how often, as these may be several again; by
+# how much the misfit has to fall, in the noise's variance, for each number that bodies have more than the surface,
+# or half of their own (4 to 30 of balls, leaves and tables that are one, 45 to 2000 of bodies that are several).
+BODY_STEPS, BODY_ROUNDS, BODY_GAIN = 2, 2, 40.0
+
+
+class Body(NamedTuple):
+    """A surface, or a part of one."""
+
+    mask: NDArray[np.bool_]  # (rows, columns), where it may be
+    light: Image  # (rows, columns)
+    basis: SmoothBasis
+    coefficients: FloatArray
+
+
+def part_bodies(solver: AmplitudeSolver) -> AmplitudeSolver:
+    """Give bodies that touch at one range surfaces of their own, where these explain the shot better."""
+    doubtful: Sequence[int] = range(len(solver.model.masks))
+    for _ in range(BODY_ROUNDS):
+        apart = take_apart(solver, doubtful)
+        found = _find_bodies(apart)
+        if not found:
+            break
+        better = _try_bodies(take_apart(apart, list(found)), list(found.values()))
+        surfaces = [doubtful[number] for number in found]
+        solver, doubtful = _replace(solver, dict(zip(surfaces, better, strict=True)))
+        if not doubtful:
+            break
+    return solver
+
+
+def _find_bodies(solver: AmplitudeSolver) -> dict[int, list[Body]]:
+    """The bodies of which surfaces may consist, of those that may be several."""
+    model = solver.model
+    rest, ray_length = model.image - model.render(solver.amplitude), measure_rays(model.camera)
+    shifts = measure_local_shifts(model, solver.amplitude, rest) / SHIFT_SHOWN
+    variance = solver.estimate_local_variance()
+    distance = model.distance + follow_local_shifts(solver, rest, variance, shifts)
+    lit = find_lit(solver, LIT_SIGMAS, BODY_FRACTION)[model.masks]
+    found = {}
+    for surface, part in enumerate(model.parts):
+        own = part.start + np.flatnonzero(lit[part])
+        if own.size:
+            deviation = np.full(own.size, TINY)
+            whole = Patch.fit(model.pixel[own], distance[own], deviation, ray_length)
+            patches = find_bodies(whole, FOLLOWED_BINS * model.row_m)
+            if len(patches) > 1:
+                found[surface] = _divide(solver, surface, patches)
+    return found
+
+
+def _divide(solver: AmplitudeSolver, surface: int, patches: Sequence[Patch]) -> list[Body]:
+    """Give each point of a surface to the nearest of some patches."""
+    mask, light, *_ = _list_bodies(solver)[surface]
+    label = np.zeros(mask.shape, np.intp)
+    for number, patch in enumerate(patches):
+        label.ravel()[patch.pixels] = number + 1
+    nearest = scipy.ndimage.distance_transform_edt(
+        label == 0, return_distances=False, return_indices=True
+    )
+    owner, about = label[tuple(nearest)], np.ones((2 * BODY_MARGIN_PX + 1,) * 2)
+    bodies = []
+    for number, patch in enumerate(patches):
+        own = owner == number + 1
+        reached = own | scipy.ndimage.binary_dilation(label == number + 1, about)
+        seen = np.where(own, light, np.float32(0))
+        bodies.append(Body(mask & reached, seen, patch.basis, patch.coefficients))
+    return bodies
+
+
+def _try_bodies(solver: AmplitudeSolver, found: Sequence[list[Body]]) -> list[list[Body]]:
+    """Take steps on surfaces, and on the bodies of each; return what of both explains the shot better, bodies if
+    they are worth their freedom.
+    """
+    trial, _ = _replace(solver, dict(enumerate(found)))
+    light, fallen = solver.model.render(solver.amplitude), np.zeros_like(solver.model.image)
+    for one, sign in ((solver, 1), (trial, -1)):
+        one.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        step = None
+        for _ in range(BODY_STEPS):
+            step = refine_state(one.model, one.amplitude, step, instrument=False)
+            one.amplitude = step.amplitude
+            one.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        assert step is not None
+        fallen += sign * step.rest**2
+    model, bodies = solver.model, iter(_list_bodies(trial))
+    gained = share_misfit(model, solver.amplitude, light, model.weights * fallen)
+    kept = []
+    for whole, part, begun in zip(_list_bodies(solver), model.parts, found, strict=True):
+        parts = [next(bodies) for _ in begun]
+        own = sum(body.coefficients.size for body in parts)
+        freedom = max(own - whole.coefficients.size, own / 2)
+        better = float(gained[part].sum()) > BODY_GAIN * solver.variance * freedom
+        kept.append(parts if better else [whole])
+    return kept
+
+
+def _list_bodies(solver: AmplitudeSolver) -> list[Body]:
+    """All surfaces of a shot."""
+    model, bodies = solver.model, []
+    shapes = zip(model.masks, model.parts, model.bases, model.state.coefficients, strict=True)
+    for mask, part, basis, coefficients in shapes:
+        light = np.zeros(mask.shape, np.float32)
+        light[mask] = solver.amplitude[part]
+        bodies.append(Body(mask, light, basis, coefficients))
+    return bodies
+
+
+def _replace(
+    solver: AmplitudeSolver, parts: Mapping[int, list[Body]]
+) -> tuple[AmplitudeSolver, list[int]]:
+    """Have bodies in place of some surfaces; also return the numbers of those of which one became several."""
+    model, owners = solver.model, list[int]()
+    bodies, several = list[Body](), list[int]()
+    for surface, whole in enumerate(_list_bodies(solver)):
+        own = parts.get(surface, [whole])
+        if len(own) > 1:
+            several += range(len(bodies), len(bodies) + len(own))
+        bodies += own
+        owners += [surface] * len(own)
+    masks = np.array([body.mask for body in bodies])
+    shapes = [body.coefficients for body in bodies]
+    state = replace(model.state.copy(), coefficients=shapes, shading=model.state.shading[owners])
+    parted = AmplitudeSolver(
+        model.lay_out(masks, [body.basis for body in bodies], state),
+        np.array([body.light for body in bodies])[masks],
+        solver.weight,
+    )
+    parted.variance = solver.variance
+    return parted, several

@@ -1,0 +1,196 @@
+"""Where a patch is several bodies that touch at one range, as a head and a torso, or two leaves: at valleys, at
+creases, and where most of it is one surface and the rest off it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from tofclip.arrays import FloatArray
+from tofclip.recovery.surfaces.patches import (
+    BEND_BINS,
+    BENT_FRACTION,
+    MIN_PATCH_PX,
+    NEIGHBOURS_PX,
+    SPLIT_BINS,
+    UNBENT_BINS,
+    Patch,
+    bend_where_needed,
+)
+from tofclip.recovery.surfaces.shapes import Pixels, fit_quadric
+
+# Misfit in its returns' deviations from which on a patch may be two at a crease (0.67 are expected of a surface's),
+# and what is left of it where it is: with as much freedom again a ball alone has 0.5.
+CREASE_SIGMAS, CREASE_FRACTION, CREASE_ROUNDS = 0.67, 0.5, 8
+VALLEY_BINS = 2.0  # by which a valley between two bodies is farther than either
+# Where the shot decides which bodies are kept: what is left of the distances from one surface, for several to
+# be tried, and below which no others are.
+TRIED_FRACTION, PARTED_FRACTION = 0.75, 0.5
+OFF_SCALES = 2.0  # of the usual distance from a surface: what is further off together is another's
+
+
+def bend_patches(patches: list[Patch], bin_m: float) -> list[Patch]:
+    """Bend plain patches where their returns are, and part them at creases; the largest first."""
+    bent = (bend_where_needed(patch, bin_m) for patch in patches)
+    parts = [part for patch in bent for part in _part_at_creases(patch, bin_m)]
+    return sorted(parts, key=lambda part: -part.pixels.size)
+
+
+def _part_at_creases(patch: Patch, bin_m: float) -> list[Patch]:
+    """Return the parts of a patch, bent where needed as they are, where surfaces of their own follow the
+    returns of each far better: things that touch at one range, as a ball and the cable on which it hangs,
+    or two limbs; else the patch.
+    """
+    error = patch.compute_error()
+    if error < BEND_BINS * bin_m:
+        return [patch]
+    parts, left = _try_label(patch, find_valleys(patch, bin_m), bin_m)
+    if left >= BENT_FRACTION * error:
+        if error < UNBENT_BINS * bin_m or patch.compute_misfit(patch) < CREASE_SIGMAS:
+            return [patch]
+        parts, left = _try_label(patch, _find_crease(patch, bin_m), bin_m)
+        if left >= CREASE_FRACTION * error:
+            return [patch]
+    return [part for piece in parts for part in _part_at_creases(piece, bin_m)]
+
+
+def _try_label(patch: Patch, label: Pixels, bin_m: float) -> tuple[list[Patch], float]:
+    """Parts of a patch, bent where needed, by the number that each return has, (n,), and the median distance of
+    their returns from them.
+    """
+    parts = [bend_where_needed(part, bin_m) for part in _take_parts(patch, label)]
+    if len(parts) < 2:
+        return [patch], np.inf
+    off = [np.abs(one.compute_ranges(one.pixels) - one.distance) for one in parts]
+    return parts, float(np.median(np.concatenate(off)))
+
+
+def find_bodies(patch: Patch, bin_m: float) -> list[Patch]:
+    """Return the bodies, all of second order, of which a patch may consist, or the patch."""
+    patch = _make_round(patch, bin_m)
+    error = _measure_distance([patch], bin_m)
+    if error < BEND_BINS * bin_m or patch.pixels.size < 2 * MIN_PATCH_PX:
+        return [patch]
+    best, least = [patch], TRIED_FRACTION * error
+    for find in find_valleys, _find_off, _find_crease:
+        parts = [_make_round(part, bin_m) for part in _take_parts(patch, find(patch, bin_m))]
+        if len(parts) > 1 and (left := _measure_distance(parts, bin_m)) < least:
+            best, least = parts, left
+        if least < PARTED_FRACTION * error:
+            break
+    return best
+
+
+def _take_parts(patch: Patch, label: Pixels) -> list[Patch]:
+    """The large enough parts of a patch by the number that each return has, (n,)."""
+    numbers, sizes = np.unique(label, return_counts=True)
+    return [patch.take(label == one) for one in numbers[sizes >= MIN_PATCH_PX]]
+
+
+def _make_round(patch: Patch, bin_m: float) -> Patch:
+    """A patch with a surface of second order if its returns need it and are nearer to that."""
+    if _measure_distance([patch], bin_m) < BEND_BINS * bin_m:
+        return patch
+    inverse = patch.ray_length.ravel()[patch.pixels] / patch.distance
+    basis, coefficients = fit_quadric(patch.pixels, inverse, patch.basis.image_shape)
+    curved = replace(patch, basis=basis, coefficients=coefficients)
+    return min(patch, curved, key=lambda one: _measure_distance([one], bin_m))
+
+
+def _measure_distance(patches: Sequence[Patch], bin_m: float) -> float:
+    """Mean distance of returns from the surfaces of their patches; none counts for more than a few bins."""
+    off = [np.abs(one.compute_ranges(one.pixels) - one.distance) for one in patches]
+    return float(np.mean(np.minimum(np.concatenate(off), SPLIT_BINS * bin_m)))
+
+
+def find_valleys(patch: Patch, bin_m: float) -> Pixels:
+    """Number the bodies, (n,), between which valleys are: each bulges towards the camera, and its range rises on
+    all sides to where it ends or meets another (watersheds, L. Vincent and P. Soille, IEEE Trans. Pattern
+    Anal. Mach. Intell. 13, 583, 1991).
+    """
+    columns = patch.ray_length.shape[1] + 2  # none is beside the next row's
+    y, x = np.divmod(patch.pixels, columns - 2)
+    places: list[int] = (y * columns + x).tolist()
+    beside = [down * columns + right for down in (-1, 0, 1) for right in (-1, 0, 1)]
+    owner: dict[int, int] = {}
+    joined: list[int] = []  # of each body, itself or the one of which it is a part
+    nearest: list[float] = []
+
+    def find(body: int) -> int:
+        while joined[body] != body:
+            body = joined[body]
+        return body
+
+    for index in np.argsort(patch.distance, kind="stable"):
+        here, distance = places[index], float(patch.distance[index])
+        bodies = {find(owner[here + way]) for way in beside if here + way in owner}
+        if not bodies:
+            bodies = {len(joined)}
+            joined.append(len(joined))
+            nearest.append(distance)
+        first, *others = sorted(bodies, key=nearest.__getitem__)
+        owner[here] = first
+        for other in others:
+            if distance - nearest[other] < VALLEY_BINS * bin_m:
+                joined[other] = first
+    return np.array([find(owner[here]) for here in places], np.intp)
+
+
+def _find_off(patch: Patch, bin_m: float) -> Pixels:
+    """Number what lies off the surface together, (n,); 0 is what does not."""
+    off = patch.compute_ranges(patch.pixels) - patch.distance
+    least = OFF_SCALES * 1.4826 * float(np.median(np.abs(off)))
+    mean = _add_up_beside(patch, off) / _add_up_beside(patch, np.ones_like(off))
+    label, number = np.zeros(off.size, np.intp), 0
+    for side in (mean, -mean):
+        picture = np.zeros(patch.ray_length.shape, bool)
+        picture.ravel()[patch.pixels] = side > least
+        pieces, count = scipy.ndimage.label(picture)
+        large = np.bincount(pieces.ravel()) >= MIN_PATCH_PX
+        own = pieces.ravel()[patch.pixels]
+        own = np.where(large[own], own, 0)
+        label[own > 0] = number + own[own > 0]
+        number += count
+    return label
+
+
+def _find_crease(patch: Patch, bin_m: float) -> Pixels:
+    """Number, 0 and 1, which of two quadratics returns follow, (n,), of those that follow them best."""
+    y, x = np.divmod(patch.pixels, patch.ray_length.shape[1])
+    best, least = np.zeros(patch.pixels.size, np.intp), np.inf
+    for across in (x, y, x + y, x - y):
+        second = _part_in_two(patch, across > np.median(across), SPLIT_BINS * bin_m)
+        parts = _take_parts(patch, second.astype(np.intp))
+        if len(parts) > 1 and (left := _measure_distance(parts, bin_m)) < least:
+            best, least = second.astype(np.intp), left
+    return best
+
+
+def _part_in_two(patch: Patch, second: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
+    """Say which returns follow the second of two quadratics better, (n,), with those about them, from a
+    first guess on. No return counts for more than `most`, m.
+    """
+    for _ in range(CREASE_ROUNDS):
+        if min(second.sum(), (~second).sum()) < MIN_PATCH_PX:
+            break
+        fits = (patch.take(own).compute_ranges(patch.pixels) for own in (~second, second))
+        off = [
+            _add_up_beside(patch, np.minimum(np.abs(fit - patch.distance), most)) for fit in fits
+        ]
+        before, second = second, off[1] < off[0]
+        if (before == second).all():
+            break
+    return second
+
+
+def _add_up_beside(patch: Patch, values: FloatArray) -> FloatArray:
+    """Values of returns, (n,), added up over the pixels about each, on one scale."""
+    picture = np.bincount(patch.pixels, values, patch.ray_length.size)
+    picture = picture.reshape(patch.ray_length.shape)
+    total = scipy.ndimage.uniform_filter(picture, NEIGHBOURS_PX, mode="constant")
+    return np.asarray(total.ravel()[patch.pixels])
