@@ -53,7 +53,8 @@ def _part_at_creases(patch: Patch, bin_m: float) -> list[Patch]:
     if left >= BENT_FRACTION * error:
         if error < UNBENT_BINS * bin_m or patch.compute_misfit(patch) < CREASE_SIGMAS:
             return [patch]
-        parts, left = _try_label(patch, _find_crease(patch, bin_m), bin_m)
+        tried = [_try_label(patch, label, bin_m) for label in _find_creases(patch, bin_m)]
+        parts, left = min(tried, key=lambda one: one[1])
         if left >= CREASE_FRACTION * error:
             return [patch]
     return [part for piece in parts for part in _part_at_creases(piece, bin_m)]
@@ -77,10 +78,11 @@ def find_bodies(patch: Patch, bin_m: float) -> list[Patch]:
     if error < BEND_BINS * bin_m or patch.pixels.size < 2 * MIN_PATCH_PX:
         return [patch]
     best, least = [patch], TRIED_FRACTION * error
-    for find in find_valleys, _find_off, _find_crease:
-        parts = [_make_round(part, bin_m) for part in _take_parts(patch, find(patch, bin_m))]
-        if len(parts) > 1 and (left := _measure_distance(parts, bin_m)) < least:
-            best, least = parts, left
+    for find in find_valleys, _find_off, _find_creases:
+        for label in np.atleast_2d(find(patch, bin_m)):
+            parts = [_make_round(part, bin_m) for part in _take_parts(patch, label)]
+            if len(parts) > 1 and (left := _measure_distance(parts, bin_m)) < least:
+                best, least = parts, left
         if least < PARTED_FRACTION * error:
             break
     return best
@@ -159,16 +161,12 @@ def _find_off(patch: Patch, bin_m: float) -> Pixels:
     return label
 
 
-def _find_crease(patch: Patch, bin_m: float) -> Pixels:
-    """Number, 0 and 1, which of two quadratics returns follow, (n,), of those that follow them best."""
+def _find_creases(patch: Patch, bin_m: float) -> Pixels:
+    """Number, 0 and 1, which of two quadratics returns follow, from some first guesses on, (guesses, n)."""
     y, x = np.divmod(patch.pixels, patch.ray_length.shape[1])
-    best, least = np.zeros(patch.pixels.size, np.intp), np.inf
-    for across in (x, y, x + y, x - y):
-        second = _part_in_two(patch, across > np.median(across), SPLIT_BINS * bin_m)
-        parts = _take_parts(patch, second.astype(np.intp))
-        if len(parts) > 1 and (left := _measure_distance(parts, bin_m)) < least:
-            best, least = second.astype(np.intp), left
-    return best
+    most = SPLIT_BINS * bin_m
+    found = (_part_in_two(patch, one > np.median(one), most) for one in (x, y, x + y, x - y))
+    return np.array([*found], np.intp)
 
 
 def _part_in_two(patch: Patch, second: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
