@@ -207,7 +207,7 @@ def test_a_table_in_little_light_is_found_as_far_as_it_reaches():
 def test_a_steep_surface_that_ends_within_pixels_shows_neither_pulse_nor_place_wrong():
     """A table of which a pixel spans 27 mm was 6 to 16 mm off, two to four times what it said: its slope was
     taken for the pulse, and the light of its borders for that of whole pixels; its far edge was missed. Seeds 0
-    and 1 are now 0.9 mm off; of seed 2, whose returns are those of three surfaces, 11 mm are left.
+    to 3 are now 0.8, 1.6, 1.8 and 1.0 mm off.
     """
     table = plate("table", (0, 0.3, 2.8), (2.4, 1.1), 0.5, 0.1, 0.8)
     wall = plate("wall", (0, 0, 4.2), (4, 4), 0.45, -0.15)
@@ -215,8 +215,8 @@ def test_a_steep_surface_that_ends_within_pixels_shows_neither_pulse_nor_place_w
     _, score = recover_shot(shot, shot.true_camera)
     assert score["miss"] < 0.01  # 0
     assert score["false"] < 0.005
-    assert score["medians_mm"]["table"] < 1.6
-    assert score["z"]["table"] < 2
+    assert score["medians_mm"]["table"] < 2.5
+    assert score["z"]["table"] < 2.2  # 1.7
 
 
 @pytest.mark.nightly

@@ -20,7 +20,7 @@ from tofclip.recovery.surfaces.amplitudes import (
     share_misfit,
 )
 from tofclip.recovery.surfaces.creases import find_bodies
-from tofclip.recovery.surfaces.extents import LIT_SIGMAS, find_lit, take_apart
+from tofclip.recovery.surfaces.extents import LIT_SIGMAS, find_lit, find_steep, take_apart
 from tofclip.recovery.surfaces.patches import Patch
 from tofclip.recovery.surfaces.pulse import Image
 from tofclip.recovery.surfaces.ranges import refine_state
@@ -71,9 +71,11 @@ def _find_bodies(solver: AmplitudeSolver) -> dict[int, list[Body]]:
     distance = model.distance + follow_local_shifts(solver, rest, variance, shifts)
     lit = find_lit(solver, LIT_SIGMAS, BODY_FRACTION)[model.masks]
     found = {}
+    # where a pixel has no one range, returns do not lie on any surface
+    flat = ~find_steep(solver) | [not basis.is_quadratic for basis in model.bases]
     for surface, part in enumerate(model.parts):
         own = part.start + np.flatnonzero(lit[part])
-        if own.size:
+        if own.size and flat[surface]:
             deviation = np.full(own.size, TINY)
             whole = Patch.fit(model.pixel[own], distance[own], deviation, ray_length)
             patches = find_bodies(whole, FOLLOWED_BINS * model.row_m)

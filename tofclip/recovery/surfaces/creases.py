@@ -22,12 +22,13 @@ from tofclip.recovery.surfaces.patches import (
     Patch,
     bend_where_needed,
 )
-from tofclip.recovery.surfaces.shapes import Pixels, fit_quadric
+from tofclip.recovery.surfaces.shapes import TINY, Pixels, fit_quadric
 
 # Misfit in its returns' deviations from which on a patch may be two at a crease (0.67 are expected of a surface's),
 # and what is left of it where it is: with as much freedom again a ball alone has 0.5.
 CREASE_SIGMAS, CREASE_FRACTION, CREASE_ROUNDS = 0.67, 0.5, 8
-VALLEY_BINS = 2.0  # by which a valley between two bodies is farther than either
+# By which a valley between two bodies is farther than either, and of what neighbours scatter.
+VALLEY_BINS, VALLEY_SCALES = 2.0, 4.0
 # Where the shot decides which bodies are kept: what is left of the distances from one surface, for several to
 # be tried, and below which no others are.
 TRIED_FRACTION, PARTED_FRACTION = 0.75, 0.5
@@ -115,6 +116,8 @@ def find_valleys(patch: Patch, bin_m: float) -> Pixels:
     all sides to where it ends or meets another (watersheds, L. Vincent and P. Soille, IEEE Trans. Pattern
     Anal. Mach. Intell. 13, 583, 1991).
     """
+    rough = np.median(np.abs(patch.distance - _average_beside(patch, patch.distance)))
+    least = max(VALLEY_BINS * bin_m, VALLEY_SCALES * 1.4826 * float(rough))
     columns = patch.ray_length.shape[1] + 2  # none is beside the next row's
     y, x = np.divmod(patch.pixels, columns - 2)
     places: list[int] = (y * columns + x).tolist()
@@ -138,7 +141,7 @@ def find_valleys(patch: Patch, bin_m: float) -> Pixels:
         first, *others = sorted(bodies, key=nearest.__getitem__)
         owner[here] = first
         for other in others:
-            if distance - nearest[other] < VALLEY_BINS * bin_m:
+            if distance - nearest[other] < least:
                 joined[other] = first
     return np.array([find(owner[here]) for here in places], np.intp)
 
@@ -147,7 +150,7 @@ def _find_off(patch: Patch, bin_m: float) -> Pixels:
     """Number what lies off the surface together, (n,); 0 is what does not."""
     off = patch.compute_ranges(patch.pixels) - patch.distance
     least = OFF_SCALES * 1.4826 * float(np.median(np.abs(off)))
-    mean = _add_up_beside(patch, off) / _add_up_beside(patch, np.ones_like(off))
+    mean = _average_beside(patch, off)
     label, number = np.zeros(off.size, np.intp), 0
     for side in (mean, -mean):
         picture = np.zeros(patch.ray_length.shape, bool)
@@ -178,7 +181,7 @@ def _part_in_two(patch: Patch, second: NDArray[np.bool_], most: float) -> NDArra
             break
         fits = (patch.take(own).compute_ranges(patch.pixels) for own in (~second, second))
         off = [
-            _add_up_beside(patch, np.minimum(np.abs(fit - patch.distance), most)) for fit in fits
+            _average_beside(patch, np.minimum(np.abs(fit - patch.distance), most)) for fit in fits
         ]
         before, second = second, off[1] < off[0]
         if (before == second).all():
@@ -186,9 +189,11 @@ def _part_in_two(patch: Patch, second: NDArray[np.bool_], most: float) -> NDArra
     return second
 
 
-def _add_up_beside(patch: Patch, values: FloatArray) -> FloatArray:
-    """Values of returns, (n,), added up over the pixels about each, on one scale."""
-    picture = np.bincount(patch.pixels, values, patch.ray_length.size)
-    picture = picture.reshape(patch.ray_length.shape)
-    total = scipy.ndimage.uniform_filter(picture, NEIGHBOURS_PX, mode="constant")
-    return np.asarray(total.ravel()[patch.pixels])
+def _average_beside(patch: Patch, values: FloatArray) -> FloatArray:
+    """Mean of values of returns, (n,), over those in the pixels about each."""
+    pictures = np.zeros((2, *patch.ray_length.shape))
+    flat = pictures.reshape(2, -1)
+    flat[0, patch.pixels], flat[1, patch.pixels] = values, 1
+    beside = (0, NEIGHBOURS_PX, NEIGHBOURS_PX)
+    total, count = scipy.ndimage.uniform_filter(pictures, beside, mode="constant")
+    return np.asarray((total / np.maximum(count, TINY)).ravel()[patch.pixels])

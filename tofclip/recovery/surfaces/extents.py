@@ -19,7 +19,7 @@ from tofclip.recovery.surfaces.patches import (
     MIN_BEHIND_FRACTION,
     rank_within_pixels,
 )
-from tofclip.recovery.surfaces.pulse import Image
+from tofclip.recovery.surfaces.pulse import TINY, Image
 from tofclip.recovery.surfaces.shapes import Pixels
 
 # Of a surface's lit points: that many within as many bins of another's may be the other's
@@ -33,6 +33,9 @@ LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 3.5, 0.05, 3
 # pixels that near the border, and by how much of the noise's variance the misfit falls for each new lit point
 # (7 and more of tables and a plate in 200 photons; in 50, up to 2.7 of surfaces that end there).
 SURELY_LIT_SIGMAS, BORDER_PX, MIN_BORDER_PX, LEAST_GAIN = 5.0, 2, 10, 4.0
+STEEP_PULSES = (
+    2.5  # the range that a pixel spans, in the pulse's deviations, mean over a surface's light
+)
 MOST_EXCESS = 4.0  # of the misfit's variance over the noise's: 1 of simulated shots, 60 of the recorded scene5
 
 
@@ -89,6 +92,14 @@ def find_lit(solver: AmplitudeSolver, sigmas: float, fraction: float) -> NDArray
         least = fraction * find_usual_brightness(amplitude, out, LIT_SIGMAS)
         own[mask] = (out > sigmas) & (amplitude > least)
     return lit
+
+
+def find_steep(solver: AmplitudeSolver) -> NDArray[np.bool_]:
+    """Say which surfaces are so steep, (surfaces,), that a pixel has no one range."""
+    model, light = solver.model, solver.amplitude + np.float32(TINY)
+    spans = np.hypot(*model.compute_slopes()) / (model.pulse.sigma * model.row_m)
+    whole, spanned = (np.bincount(model.surface, one) for one in (light, light * spans))
+    return np.asarray(spanned >= STEEP_PULSES * whole)
 
 
 def find_candidates(

@@ -25,7 +25,13 @@ from tofclip.recovery.surfaces.amplitudes import (
     scale_amplitude,
 )
 from tofclip.recovery.surfaces.bodies import part_bodies
-from tofclip.recovery.surfaces.extents import grow_surfaces, join_surfaces, keep_lit, take_apart
+from tofclip.recovery.surfaces.extents import (
+    find_steep,
+    grow_surfaces,
+    join_surfaces,
+    keep_lit,
+    take_apart,
+)
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.others import find_others
 from tofclip.recovery.surfaces.patches import find_dimmer_patches
@@ -62,7 +68,7 @@ from tofclip.solvers import Progress, ignore_progress
 from tofclip.threads import limit_blas_threads
 
 PULSE_ITERATIONS = 10  # of those at the start, before the pulse is measured
-MIN_REFINEMENTS, MAX_REFINEMENTS = 2, 4  # steps on ranges, before surfaces are parted and after it
+MIN_REFINEMENTS, MAX_REFINEMENTS = 3, 4  # steps on ranges, before surfaces are parted and after it
 # What dim light costs, in deviations, and for how many iterations at most, where it is to stay only as
 # the shot needs it: first it gives way, then what is needed comes back. Fewer after the first shot.
 SPARSELY, FOLLOWING_SPARSELY = ((4.0, 80), (2.0, 20)), ((4.0, 30), (2.0, 10))
@@ -72,9 +78,10 @@ LAST_STEP_SIGMAS = 0.15
 # leads on that far where the one before led; others are at their end, or nowhere.
 LONG_STEP_SIGMAS, SETTLING_STEPS, LAST_SETTLING_STEPS, GOES_ON = 0.7, 3, 8, 0.5
 MOST_ONWARD = 0.75  # of a step, how far the next may be thought to lead
-# In the pulse's standard deviations: the range that a pixel of a steep surface spans, mean over its light, and
-# by how much the pulses are longer that lead nearer to it, one after the other.
-STEEP_PULSES, LONGER_PULSES = 3.0, (12.0, 4.0)
+LONGER_PULSES = (
+    12.0,
+    4.0,
+)  # by as many deviations longer, one after the other, that lead nearer to a steep surface
 # Where the last shot's fit begins: before and after the ranges' step, and how far beyond the returns
 # of quick frames surfaces may reach.
 FOLLOWING_ITERATIONS, FOLLOWING_MARGIN_PX = 10, 4
@@ -314,17 +321,17 @@ def _approach_steep(solver: AmplitudeSolver, darkness: float) -> None:
     """
     if darkness > DIM:
         return
-    model = solver.model
-    sigma, light = model.pulse.sigma, solver.amplitude + np.float32(TINY)
-    spans = np.hypot(*model.compute_slopes()) / (sigma * model.row_m)
-    if all(np.average(spans[part], weights=light[part]) < STEEP_PULSES for part in model.parts):
+    steep = find_steep(solver)
+    if not steep.any():
         return
+    apart = take_apart(solver, np.flatnonzero(steep))
     for pulses in LONGER_PULSES:
-        longer = model.lengthen(pulses * sigma, solver.amplitude)
-        trial = AmplitudeSolver(longer, solver.amplitude, solver.weight, solver)
+        longer = apart.model.lengthen(pulses * solver.model.pulse.sigma, apart.amplitude)
+        trial = AmplitudeSolver(longer, apart.amplitude, solver.weight, apart)
         trial.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
-        solver.amplitude = refine_state(longer, trial.amplitude, instrument=False).amplitude
-        model.place(longer.state)
+        apart.amplitude = refine_state(longer, trial.amplitude, instrument=False).amplitude
+        apart.model.place(longer.state)
+    _put_back(solver, steep, apart)
     solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
 
 
@@ -386,7 +393,7 @@ def settle_surfaces(
     """
     if not chosen.any():
         return
-    model, own = solver.model, chosen[solver.model.surface]
+    own = chosen[solver.model.surface]
     apart = take_apart(solver, np.flatnonzero(chosen))
     step = replace(found, explained=found.explained[:, own], free=None)
     moved = np.zeros(apart.amplitude.size)
@@ -401,12 +408,17 @@ def settle_surfaces(
             break
         if number and _lead_on(moved, earlier, apart.amplitude) < GOES_ON:
             break
-    state = model.state.copy()
+    _put_back(solver, chosen, apart)
+
+
+def _put_back(solver: AmplitudeSolver, chosen: NDArray[np.bool_], apart: AmplitudeSolver) -> None:
+    """Have some surfaces, (surfaces,), as they became apart from the others."""
+    state = solver.model.state.copy()
     shapes = zip(np.flatnonzero(chosen), apart.model.state.coefficients, strict=True)
     for surface, coefficients in shapes:
         state.coefficients[surface] = coefficients
-    model.place(state)
-    solver.amplitude[own] = apart.amplitude
+    solver.model.place(state)
+    solver.amplitude[chosen[solver.model.surface]] = apart.amplitude
 
 
 def extrapolate_step(last: FloatArray, earlier: FloatArray, light: Image) -> FloatArray:
