@@ -92,6 +92,19 @@ def sphere(name, centre, radius, reflectance, directed=0.0):
     return Surface(name, middle, radius, meet, directed)
 
 
+def ellipsoid(name, centre, radii, reflectance):
+    """A body of three half axes, to the right, down and away."""
+    middle, half = np.array(centre, float), np.array(radii, float)
+
+    def meet(origin, rays):
+        start, ways = (origin - middle) / half, rays / half
+        found = meet_round(start, ways, ways, 1.0, reflectance, lambda at: at)
+        normal = found.normal / half
+        return found._replace(normal=normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+    return Surface(name, middle, float(half.max()), meet)
+
+
 def cylinder(name, start, end, radius, reflectance):
     """A round rod between two points, without its ends."""
     first, axis = np.array(start, float), np.array(end, float) - np.array(start, float)
