@@ -29,11 +29,11 @@ from tofclip.recovery.surfaces.shifts import SHIFT_SHOWN, follow_local_shifts, m
 from tofclip.recovery.surfaces.start import measure_rays
 
 BODY_FRACTION = 0.3  # of a surface's usual brightness: ranges of what is dimmer say little
-FOLLOWED_BINS = 0.25  # ranges that follow the shot are as many bins off as those of frames are bins
+FOLLOWED_BINS = 0.25  # off by which ranges that follow the shot are, and those of frames by one
 BODY_MARGIN_PX = 3  # how far one body may reach into the next
-# Steps until bodies are compared with what they were taken for, and how often, as these may be several again; by
-# how much the misfit has to fall, in the noise's variance, for each number that bodies have more than the surface,
-# or half of their own (4 to 30 of balls, leaves and tables that are one, 45 to 2000 of bodies that are several).
+# Steps until bodies are compared with the surface that they were taken for, and how often, as they may be several
+# again; by how much the misfit has to fall, in the noise's variance, for each number that bodies have more than the
+# surface, or half of their own (4 to 30 where balls, leaves and tables were one, 45 to 2000 where bodies were several).
 BODY_STEPS, BODY_ROUNDS, BODY_GAIN = 2, 2, 40.0
 
 
