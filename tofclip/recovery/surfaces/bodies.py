@@ -34,7 +34,7 @@ BODY_MARGIN_PX = 3  # how far one body may reach into the next
 # Steps until bodies are compared with the surface that they were taken for, and how often, as they may be several
 # again; by how much the misfit has to fall, in the noise's variance, for each number that bodies have more than the
 # surface, or half of their own (4 to 30 where balls, leaves and tables were one, 45 to 2000 where bodies were several).
-BODY_STEPS, BODY_ROUNDS, BODY_GAIN = 2, 2, 40.0
+BODY_STEPS, BODY_ROUNDS, BODY_GAIN = 2, 3, 40.0
 
 
 class Body(NamedTuple):

@@ -31,7 +31,7 @@ CREASE_SIGMAS, CREASE_FRACTION, CREASE_ROUNDS = 0.67, 0.5, 8
 VALLEY_BINS, VALLEY_SCALES = 2.0, 4.0
 # Where the shot decides which bodies are kept: what is left of the distances from one surface, for several to
 # be tried, and below which no others are.
-TRIED_FRACTION, PARTED_FRACTION = 0.75, 0.5
+TRIED_FRACTION, PARTED_FRACTION = 0.85, 0.5
 OFF_SCALES = 2.0  # of the usual distance from a surface: what is further off together is another's
 
 
