@@ -29,7 +29,7 @@ from tofclip.recovery.surfaces.shifts import SHIFT_SHOWN, follow_local_shifts, m
 from tofclip.recovery.surfaces.start import measure_rays
 
 BODY_FRACTION = 0.3  # of a surface's usual brightness: ranges of what is dimmer say little
-FOLLOWED_BINS = 0.25  # off by which ranges that follow the shot are, and those of frames by one
+FOLLOWED_BINS = 0.25  # ranges that follow the shot are that much nearer than those of frames
 BODY_MARGIN_PX = 3  # how far one body may reach into the next
 # Steps until bodies are compared with the surface that they were taken for, and how often, as they may be several
 # again; by how much the misfit has to fall, in the noise's variance, for each number that bodies have more than the
@@ -70,7 +70,7 @@ def _find_bodies(solver: AmplitudeSolver) -> dict[int, list[Body]]:
     variance = solver.estimate_local_variance()
     distance = model.distance + follow_local_shifts(solver, rest, variance, shifts)
     lit = find_lit(solver, LIT_SIGMAS, BODY_FRACTION)[model.masks]
-    found = {}
+    found, wholes = {}, _list_bodies(solver)
     # where a pixel has no one range, returns do not lie on any surface
     flat = ~find_steep(solver) | [not basis.is_quadratic for basis in model.bases]
     for surface, part in enumerate(model.parts):
@@ -80,13 +80,13 @@ def _find_bodies(solver: AmplitudeSolver) -> dict[int, list[Body]]:
             whole = Patch.fit(model.pixel[own], distance[own], deviation, ray_length)
             patches = find_bodies(whole, FOLLOWED_BINS * model.row_m)
             if len(patches) > 1:
-                found[surface] = _divide(solver, surface, patches)
+                found[surface] = _divide(wholes[surface], patches)
     return found
 
 
-def _divide(solver: AmplitudeSolver, surface: int, patches: Sequence[Patch]) -> list[Body]:
+def _divide(whole: Body, patches: Sequence[Patch]) -> list[Body]:
     """Give each point of a surface to the nearest of some patches."""
-    mask, light, *_ = _list_bodies(solver)[surface]
+    mask, light, *_ = whole
     label = np.zeros(mask.shape, np.intp)
     for number, patch in enumerate(patches):
         label.ravel()[patch.pixels] = number + 1

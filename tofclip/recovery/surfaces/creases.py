@@ -50,7 +50,7 @@ def _part_at_creases(patch: Patch, bin_m: float) -> list[Patch]:
     error = patch.compute_error()
     if error < BEND_BINS * bin_m:
         return [patch]
-    parts, left = _try_label(patch, find_valleys(patch, bin_m), bin_m)
+    parts, left = _try_label(patch, _find_valleys(patch, bin_m), bin_m)
     if left >= BENT_FRACTION * error:
         if error < UNBENT_BINS * bin_m or patch.compute_misfit(patch) < CREASE_SIGMAS:
             return [patch]
@@ -68,8 +68,7 @@ def _try_label(patch: Patch, label: Pixels, bin_m: float) -> tuple[list[Patch], 
     parts = [bend_where_needed(part, bin_m) for part in _take_parts(patch, label)]
     if len(parts) < 2:
         return [patch], np.inf
-    off = [np.abs(one.compute_ranges(one.pixels) - one.distance) for one in parts]
-    return parts, float(np.median(np.concatenate(off)))
+    return parts, float(np.median(_list_distances(parts)))
 
 
 def find_bodies(patch: Patch, bin_m: float) -> list[Patch]:
@@ -79,7 +78,7 @@ def find_bodies(patch: Patch, bin_m: float) -> list[Patch]:
     if error < BEND_BINS * bin_m or patch.pixels.size < 2 * MIN_PATCH_PX:
         return [patch]
     best, least = [patch], TRIED_FRACTION * error
-    for find in find_valleys, _find_off, _find_creases:
+    for find in _find_valleys, _find_off, _find_creases:
         for label in np.atleast_2d(find(patch, bin_m)):
             parts = [_make_round(part, bin_m) for part in _take_parts(patch, label)]
             if len(parts) > 1 and (left := _measure_distance(parts, bin_m)) < least:
@@ -107,11 +106,16 @@ def _make_round(patch: Patch, bin_m: float) -> Patch:
 
 def _measure_distance(patches: Sequence[Patch], bin_m: float) -> float:
     """Mean distance of returns from the surfaces of their patches; none counts for more than a few bins."""
+    return float(np.mean(np.minimum(_list_distances(patches), SPLIT_BINS * bin_m)))
+
+
+def _list_distances(patches: Sequence[Patch]) -> FloatArray:
+    """Distances of returns from the surfaces of their patches, one after the other."""
     off = [np.abs(one.compute_ranges(one.pixels) - one.distance) for one in patches]
-    return float(np.mean(np.minimum(np.concatenate(off), SPLIT_BINS * bin_m)))
+    return np.concatenate(off)
 
 
-def find_valleys(patch: Patch, bin_m: float) -> Pixels:
+def _find_valleys(patch: Patch, bin_m: float) -> Pixels:
     """Number the bodies, (n,), between which valleys are: each bulges towards the camera, and its range rises on
     all sides to where it ends or meets another (watersheds, L. Vincent and P. Soille, IEEE Trans. Pattern
     Anal. Mach. Intell. 13, 583, 1991).
