@@ -70,7 +70,7 @@ def _find_bodies(solver: AmplitudeSolver) -> dict[int, list[Body]]:
     variance = solver.estimate_local_variance()
     distance = model.distance + follow_local_shifts(solver, rest, variance, shifts)
     lit = find_lit(solver, LIT_SIGMAS, BODY_FRACTION)[model.masks]
-    found, wholes = {}, _list_bodies(solver)
+    found, wholes = {}, list_bodies(solver)
     # where a pixel has no one range, returns do not lie on any surface
     flat = ~find_steep(solver) | [not basis.is_quadratic for basis in model.bases]
     for surface, part in enumerate(model.parts):
@@ -118,10 +118,10 @@ def _try_bodies(solver: AmplitudeSolver, found: Sequence[list[Body]]) -> list[li
             one.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
         assert step is not None
         fallen += sign * step.rest**2
-    model, bodies = solver.model, iter(_list_bodies(trial))
+    model, bodies = solver.model, iter(list_bodies(trial))
     gained = share_misfit(model, solver.amplitude, light, model.weights * fallen)
     kept = []
-    for whole, part, begun in zip(_list_bodies(solver), model.parts, found, strict=True):
+    for whole, part, begun in zip(list_bodies(solver), model.parts, found, strict=True):
         parts = [next(bodies) for _ in begun]
         own = sum(body.coefficients.size for body in parts)
         freedom = max(own - whole.coefficients.size, own / 2)
@@ -130,7 +130,7 @@ def _try_bodies(solver: AmplitudeSolver, found: Sequence[list[Body]]) -> list[li
     return kept
 
 
-def _list_bodies(solver: AmplitudeSolver) -> list[Body]:
+def list_bodies(solver: AmplitudeSolver) -> list[Body]:
     """All surfaces of a shot."""
     model, bodies = solver.model, []
     shapes = zip(model.masks, model.parts, model.bases, model.state.coefficients, strict=True)
@@ -147,19 +147,26 @@ def _replace(
     """Have bodies in place of some surfaces; also return the numbers of those of which one became several."""
     model, owners = solver.model, list[int]()
     bodies, several = list[Body](), list[int]()
-    for surface, whole in enumerate(_list_bodies(solver)):
+    for surface, whole in enumerate(list_bodies(solver)):
         own = parts.get(surface, [whole])
         if len(own) > 1:
             several += range(len(bodies), len(bodies) + len(own))
         bodies += own
         owners += [surface] * len(own)
-    masks = np.array([body.mask for body in bodies])
+    return lay_bodies(solver, bodies, model.state.shading[owners]), several
+
+
+def lay_bodies(
+    solver: AmplitudeSolver, bodies: Sequence[Body], shading: FloatArray
+) -> AmplitudeSolver:
+    """Return a solver of other surfaces before the same shot. `shading`: theirs, (surfaces, views)."""
+    model, masks = solver.model, np.array([body.mask for body in bodies])
     shapes = [body.coefficients for body in bodies]
-    state = replace(model.state.copy(), coefficients=shapes, shading=model.state.shading[owners])
-    parted = AmplitudeSolver(
+    state = replace(model.state.copy(), coefficients=shapes, shading=shading)
+    laid = AmplitudeSolver(
         model.lay_out(masks, [body.basis for body in bodies], state),
         np.array([body.light for body in bodies])[masks],
         solver.weight,
     )
-    parted.variance = solver.variance
-    return parted, several
+    laid.variance = solver.variance
+    return laid

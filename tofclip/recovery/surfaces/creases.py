@@ -80,8 +80,11 @@ def find_bodies(patch: Patch, bin_m: float) -> list[Patch]:
     best, least = [patch], TRIED_FRACTION * error
     for find in _find_valleys, _find_off, _find_creases:
         for label in np.atleast_2d(find(patch, bin_m)):
-            parts = [_make_round(part, bin_m) for part in _take_parts(patch, label)]
-            if len(parts) > 1 and (left := _measure_distance(parts, bin_m)) < least:
+            plain = _take_parts(patch, label)
+            if len(plain) < 2:
+                continue
+            parts = [_make_round(part, bin_m) for part in plain]
+            if (left := _measure_distance(parts, bin_m)) < least:
                 best, least = parts, left
         if least < PARTED_FRACTION * error:
             break

@@ -33,9 +33,8 @@ LIT_SIGMAS, LIT_FRACTION, LIT_MARGIN_PX = 3.5, 0.05, 3
 # pixels that near the border, and by how much of the noise's variance the misfit falls for each new lit point
 # (7 and more of tables and a plate in 200 photons; in 50, up to 2.7 of surfaces that end there).
 SURELY_LIT_SIGMAS, BORDER_PX, MIN_BORDER_PX, LEAST_GAIN = 5.0, 2, 10, 4.0
-STEEP_PULSES = (
-    2.5  # the range that a pixel spans, in the pulse's deviations, mean over a surface's light
-)
+# The range that a pixel spans, in the pulse's deviations, mean over a surface's light, from which on it is steep.
+STEEP_PULSES = 2.0
 MOST_EXCESS = 4.0  # of the misfit's variance over the noise's: 1 of simulated shots, 60 of the recorded scene5
 
 

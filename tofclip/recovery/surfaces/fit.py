@@ -33,7 +33,7 @@ from tofclip.recovery.surfaces.extents import (
     take_apart,
 )
 from tofclip.recovery.surfaces.model import SurfaceModel
-from tofclip.recovery.surfaces.others import find_others
+from tofclip.recovery.surfaces.others import add_surfaces, find_others
 from tofclip.recovery.surfaces.patches import find_dimmer_patches
 from tofclip.recovery.surfaces.pulse import (
     LEAST_EXPLAINED,
@@ -163,7 +163,8 @@ def _fit_returns(
     begun = _measure_blur(join_surfaces(keep_lit(solver)))
 
     # 5. Ranges.
-    solver, refinement, remainder = _fit_ranges(begun, darkness, tick)
+    shown = found, frames.values.sum(axis=0)
+    solver, refinement, remainder = _fit_ranges(begun, shown, darkness, tick)
     for _ in range(BLUR_ROUNDS if solver.model.blur_px else 0):
         # what ranges of frames' returns were off by had hidden a part of the blur
         better = _measure_blur(solver)
@@ -171,7 +172,7 @@ def _fit_returns(
             break
         model = begun.model.respond(better.model.pulse).blur(better.model.blur_px)
         again = AmplitudeSolver(model, begun.amplitude, weight, begun)
-        solver, refinement, remainder = _fit_ranges(again, darkness)
+        solver, refinement, remainder = _fit_ranges(again, shown, darkness)
     if solver.model.pulse.reach:
         # what seemed a tail may have been ranges that were off
         plain = _measure_pulse(solver, np.inf)
@@ -187,7 +188,10 @@ def _fit_returns(
 
 
 def _fit_ranges(
-    begun: AmplitudeSolver, darkness: float, tick: Tick = lambda: None
+    begun: AmplitudeSolver,
+    shown: tuple[Returns, Image],
+    darkness: float,
+    tick: Tick = lambda: None,
 ) -> tuple[AmplitudeSolver, Refinement, FloatArray]:
     """Fit ranges, and straighten splines that are not needed first: these take longer to be right, and late views
     give way to them. Which surfaces are several shows once they are nearly right. `begun` stays as it is.
@@ -197,7 +201,7 @@ def _fit_ranges(
     solver, straightened = straighten_surfaces(solver)
     _approach_steep(solver, darkness)
     refinement, _ = _refine(solver, straightened, tick, MIN_REFINEMENTS)
-    grown = grow_surfaces(part_bodies(solver))
+    grown = grow_surfaces(part_bodies(add_surfaces(solver, *shown)))
     if grown is not solver:
         solver = keep_lit(grown)
         refinement = refinement.cover(solver.model)

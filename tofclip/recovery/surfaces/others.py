@@ -12,12 +12,24 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.lidar import Detection
 from tofclip.lidar.significance import DEFAULT_FALSE_ALARM
-from tofclip.recovery.surfaces.amplitudes import START_ITERATIONS, AmplitudeSolver, Tick
-from tofclip.recovery.surfaces.extents import find_candidates
-from tofclip.recovery.surfaces.patches import rank_within_pixels
+from tofclip.recovery.surfaces.amplitudes import (
+    AGAINST_DIM,
+    START_ITERATIONS,
+    AmplitudeSolver,
+    Tick,
+    share_misfit,
+)
+from tofclip.recovery.surfaces.bodies import Body, lay_bodies, list_bodies
+from tofclip.recovery.surfaces.extents import LEAST_GAIN, find_candidates
+from tofclip.recovery.surfaces.patches import DIMMER_REACH_BINS, rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
 from tofclip.recovery.surfaces.shapes import Pixels
-from tofclip.recovery.surfaces.start import SURE_FALSE_ALARM, measure_rays
+from tofclip.recovery.surfaces.start import (
+    SURE_FALSE_ALARM,
+    find_brightest_patches,
+    lay_out,
+    measure_rays,
+)
 from tofclip.shots import Returns
 
 # Bins in range, and pixels, within which frames' returns and surfaces are the same.
@@ -38,11 +50,7 @@ def find_others(
     """Return those of the frames' returns that no surface is near and that the whole shot shows, with
     surfaces and all other returns free to take over their light; and the light of all.
     """
-    model = solver.model
-    chosen = find_candidates(solver, solver.measure_significance(), Detection.signal_to_noise)
-    points = model.row[chosen], model.column[chosen], model.distance[chosen]
-    near = find_near((found.y, found.x, found.range), points, model.row_m)
-    others = found[~near]
+    others = find_beside(solver, found)
     if not len(others):
         return others, solver
     dark = np.zeros(len(others), np.float32)
@@ -65,6 +73,51 @@ def find_others(
     whole, own = _add_returns(solver, others[drawn], light, ABOUT_OTHERS_PX, tick)
     whole.amplitude[own] *= (1 - doubt[drawn]) * (1 - 1 / shown[drawn] ** 2)
     return others[doubt < 0.5], whole
+
+
+def add_surfaces(solver: AmplitudeSolver, found: Returns, light: Image) -> AmplitudeSolver:
+    """Add the surfaces of frames' returns that no surface is near, where they explain the shot better: what hides
+    behind others may have been taken for a part of one, and bends it, as a melon does a table. `light`: of the
+    frames, (rows, columns).
+    """
+    model, ray_length = solver.model, measure_rays(solver.model.camera)
+    lost = find_beside(solver, found)
+    lost = lost[~(lost.false_alarm > SURE_FALSE_ALARM)]
+    for basis, coefficients in zip(model.bases, model.state.coefficients, strict=True):
+        pixel = lost.y.astype(np.intp) * ray_length.shape[1] + lost.x
+        inverse = basis.compute_inverse(basis.evaluate(pixel), coefficients)
+        off = ray_length.ravel()[pixel] / inverse - lost.range
+        lost = lost[~(np.abs(off) < DIMMER_REACH_BINS * model.row_m)]
+    patches = find_brightest_patches(lost, ray_length, model.row_m)
+    if not patches:
+        return solver
+    masks, _ = lay_out(patches, lost, light, model.row_m)
+    bodies, known = list_bodies(solver), len(model.masks)
+    for patch, mask in zip(patches, masks, strict=True):
+        seen = np.zeros(mask.shape, np.float32)
+        seen.ravel()[patch.pixels] = light.ravel()[patch.pixels]
+        bodies.append(Body(mask, seen, patch.basis, patch.coefficients))
+    shading = np.pad(model.state.shading, ((0, len(patches)), (0, 0)))
+    more = lay_bodies(solver, bodies, shading)
+    more.run(START_ITERATIONS, against_dim=AGAINST_DIM)
+    lit = more.model.render(more.amplitude)
+    before, after = (model.image - one for one in (model.render(solver.amplitude), lit))
+    gained = share_misfit(more.model, more.amplitude, lit, model.weights * (before**2 - after**2))
+    surface = more.model.surface
+    gain, points = (np.bincount(surface, one, len(bodies)) for one in (gained, more.amplitude > 0))
+    kept = gain > LEAST_GAIN * solver.variance * points
+    if not kept[known:].any():
+        return solver
+    kept[:known] = True
+    return more.cover(more.model.masks & kept[:, np.newaxis, np.newaxis])
+
+
+def find_beside(solver: AmplitudeSolver, found: Returns) -> Returns:
+    """Return those of the frames' returns that no surface is near."""
+    model = solver.model
+    chosen = find_candidates(solver, solver.measure_significance(), Detection.signal_to_noise)
+    points = model.row[chosen], model.column[chosen], model.distance[chosen]
+    return found[~find_near((found.y, found.x, found.range), points, model.row_m)]
 
 
 def _add_returns(
