@@ -68,7 +68,8 @@ from tofclip.solvers import Progress, ignore_progress
 from tofclip.threads import limit_blas_threads
 
 PULSE_ITERATIONS = 10  # of those at the start, before the pulse is measured
-MIN_REFINEMENTS, MAX_REFINEMENTS = 3, 4  # steps on ranges, before surfaces are parted and after it
+# Steps on ranges before surfaces are parted, and at most after it; where one is far off after as many, it goes on.
+MIN_REFINEMENTS, MAX_REFINEMENTS = 3, 4
 # What dim light costs, in deviations, and for how many iterations at most, where it is to stay only as
 # the shot needs it: first it gives way, then what is needed comes back. Fewer after the first shot.
 SPARSELY, FOLLOWING_SPARSELY = ((4.0, 80), (2.0, 20)), ((4.0, 30), (2.0, 10))
@@ -176,7 +177,7 @@ def _fit_returns(
     if solver.model.pulse.reach:
         # what seemed a tail may have been ranges that were off
         plain = _measure_pulse(solver, np.inf)
-        further, _ = _refine(plain, refinement, most=MIN_REFINEMENTS)
+        further, _ = _refine(plain, refinement, least=MIN_REFINEMENTS, most=MIN_REFINEMENTS)
         if plain.measure_misfit() < solver.measure_misfit():
             solver, (refinement, remainder) = plain, _refine(plain, further)
     # dim light has given way a little by now
@@ -200,7 +201,7 @@ def _fit_ranges(
     solver.model.find_behind(solver.amplitude)
     solver, straightened = straighten_surfaces(solver)
     _approach_steep(solver, darkness)
-    refinement, _ = _refine(solver, straightened, tick, MIN_REFINEMENTS)
+    refinement, _ = _refine(solver, straightened, tick, least=MIN_REFINEMENTS, most=MIN_REFINEMENTS)
     grown = grow_surfaces(part_bodies(add_surfaces(solver, *shown)))
     if grown is not solver:
         solver = keep_lit(grown)
@@ -343,23 +344,24 @@ def _refine(
     solver: AmplitudeSolver,
     found: Refinement | None,
     tick: Tick = lambda: None,
+    least: int = 1,
     most: int = MAX_REFINEMENTS,
 ) -> tuple[Refinement, FloatArray]:
-    """Steps on ranges and instrument until they hardly move; the last one, and what more would
-    change of each point's range.
+    """Steps on ranges and instrument, at least so many, until they hardly move; the last one, and what more
+    would change of each point's range.
     """
     model, moved = solver.model, np.zeros(solver.amplitude.size)
     for number in range(most):
         before = model.distance
         model.find_behind(solver.amplitude)
-        found = refine_state(model, solver.amplitude, found, number + 1 >= MIN_REFINEMENTS)
+        found = refine_state(model, solver.amplitude, found, number + 1 >= least)
         solver.amplitude = found.amplitude
         solver.run(REFINEMENT_ITERATIONS, tick, AGAINST_DIM)
         earlier, moved = moved, model.distance - before
         far, points = _measure_step(solver, moved, found)
+        if number + 1 >= least and far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
+            break
         if number + 1 >= MIN_REFINEMENTS:
-            if far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
-                break
             alone = far > LONG_STEP_SIGMAS**2 * points
             # where most of a scene moves, it may be the instrument that is not known yet
             if 2 * points[alone].sum() < points.sum():
