@@ -75,6 +75,8 @@ MIN_REFINEMENTS, MAX_REFINEMENTS = 3, 4
 SPARSELY, FOLLOWING_SPARSELY = ((4.0, 80), (2.0, 20)), ((4.0, 30), (2.0, 10))
 # Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
 LAST_STEP_SIGMAS = 0.15
+# Of the misfit with a tail: a pulse without that has more after a step does not get there (1.5 of scene5).
+SURE_TAIL = 1.2
 # After a longer one of its own a surface goes on alone, for as many steps, more after the last one, if each
 # leads on that far where the one before led; others are at their end, or nowhere.
 LONG_STEP_SIGMAS, SETTLING_STEPS, LAST_SETTLING_STEPS, GOES_ON = 0.7, 3, 8, 0.5
@@ -176,9 +178,11 @@ def _fit_returns(
         solver, refinement, remainder = _fit_ranges(again, shown, darkness)
     if solver.model.pulse.reach:
         # what seemed a tail may have been ranges that were off
-        plain = _measure_pulse(solver, np.inf)
-        further, _ = _refine(plain, refinement, least=MIN_REFINEMENTS, most=MIN_REFINEMENTS)
-        if plain.measure_misfit() < solver.measure_misfit():
+        plain, misfit = _measure_pulse(solver, np.inf), solver.measure_misfit()
+        further, _ = _refine(plain, refinement, most=1)
+        if plain.measure_misfit() < SURE_TAIL * misfit:
+            further, _ = _refine(plain, further, least=MIN_REFINEMENTS, most=MIN_REFINEMENTS)
+        if plain.measure_misfit() < misfit:
             solver, (refinement, remainder) = plain, _refine(plain, further)
     # dim light has given way a little by now
     sparse = _explain_sparsely(solver.model, solver, weight, SPARSELY)
