@@ -170,6 +170,10 @@ class AmplitudeSolver:
                 break
         self.variance = estimate_excess_variance(model, self.amplitude)
 
+    def run_briefly(self, tick: Tick = lambda: None) -> None:
+        """Take as many steps as follow one on ranges, or another change that amplitudes hardly feel."""
+        self.run(REFINEMENT_ITERATIONS, tick, AGAINST_DIM)
+
     def _cost_dim(self, sigmas: float, noise: Image) -> Image:
         """What light costs at each point for being dimmer than the brightest of its surface beside it:
         so many deviations, `noise` of the gradient, where it is dark, but no more than half of those

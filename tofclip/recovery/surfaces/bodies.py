@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.amplitudes import (
-    AGAINST_DIM,
-    REFINEMENT_ITERATIONS,
     AmplitudeSolver,
     share_misfit,
 )
@@ -23,7 +21,7 @@ from tofclip.recovery.surfaces.creases import find_bodies
 from tofclip.recovery.surfaces.extents import LIT_SIGMAS, find_lit, find_steep, take_apart
 from tofclip.recovery.surfaces.patches import Patch
 from tofclip.recovery.surfaces.pulse import Image
-from tofclip.recovery.surfaces.ranges import refine_state
+from tofclip.recovery.surfaces.ranges import take_step
 from tofclip.recovery.surfaces.shapes import TINY, SmoothBasis
 from tofclip.recovery.surfaces.shifts import SHIFT_SHOWN, follow_local_shifts, measure_local_shifts
 from tofclip.recovery.surfaces.start import measure_rays
@@ -110,12 +108,10 @@ def _try_bodies(solver: AmplitudeSolver, found: Sequence[list[Body]]) -> list[li
     trial, _ = _replace(solver, dict(enumerate(found)))
     light, fallen = solver.model.render(solver.amplitude), np.zeros_like(solver.model.image)
     for one, sign in ((solver, 1), (trial, -1)):
-        one.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        one.run_briefly()
         step = None
         for _ in range(BODY_STEPS):
-            step = refine_state(one.model, one.amplitude, step, instrument=False)
-            one.amplitude = step.amplitude
-            one.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+            step = take_step(one, step, instrument=False)
         assert step is not None
         fallen += sign * step.rest**2
     model, bodies = solver.model, iter(list_bodies(trial))

@@ -9,8 +9,6 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.recovery.surfaces.amplitudes import (
-    AGAINST_DIM,
-    REFINEMENT_ITERATIONS,
     AmplitudeSolver,
     share_misfit,
 )
@@ -56,7 +54,7 @@ def grow_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
         if not further.any():
             break
         grown = solver.cover(masks | further)
-        grown.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        grown.run_briefly()
         model, light = grown.model, grown.model.render(grown.amplitude)
         left, less = (model.image - one for one in (solver.model.render(solver.amplitude), light))
         gained = share_misfit(model, grown.amplitude, light, model.weights * (left**2 - less**2))
@@ -132,15 +130,15 @@ def join_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
     while doubles:
         pair = doubles.pop(0)
         apart, own = take_apart(solver, pair), int(pair[0] > pair[1])
-        apart.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        apart.run_briefly()
         # where the smaller is far off, the larger alone is the better guess
         trials = [apart, *(_join(apart, own, 1 - own, like) for like in ([0, 1], [own]))]
         for trial in trials[1:]:
-            trial.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+            trial.run_briefly()
         best = int(np.argmin([trial.measure_misfit() for trial in trials]))
         if best:
             solver = _join(solver, *pair, [*pair][: 3 - best])
-            solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+            solver.run_briefly()
             doubles = _list_doubles(solver)
     return solver
 

@@ -18,7 +18,6 @@ from tofclip.errors import InputError
 from tofclip.lidar import depth
 from tofclip.recovery.surfaces.amplitudes import (
     AGAINST_DIM,
-    REFINEMENT_ITERATIONS,
     START_ITERATIONS,
     AmplitudeSolver,
     Tick,
@@ -47,6 +46,7 @@ from tofclip.recovery.surfaces.ranges import (
     Refinement,
     explain_rest,
     refine_state,
+    take_step,
 )
 from tofclip.recovery.surfaces.start import (
     CHANGED_RATIO,
@@ -252,7 +252,7 @@ def _measure_blur(solver: AmplitudeSolver) -> AmplitudeSolver:
     if find_misfit(sigma_px) > LEAST_BLURRED * find_misfit(model.blur_px):
         return solver
     blurred = AmplitudeSolver(model.blur(sigma_px), amplitude, solver.weight, solver)
-    blurred.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+    blurred.run_briefly()
     return _measure_pulse(blurred)
 
 
@@ -337,11 +337,11 @@ def _approach_steep(solver: AmplitudeSolver, darkness: float) -> None:
     for pulses in LONGER_PULSES:
         longer = apart.model.lengthen(pulses * solver.model.pulse.sigma, apart.amplitude)
         trial = AmplitudeSolver(longer, apart.amplitude, solver.weight, apart)
-        trial.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        trial.run_briefly()
         apart.amplitude = refine_state(longer, trial.amplitude, instrument=False).amplitude
         apart.model.place(longer.state)
     _put_back(solver, steep, apart)
-    solver.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+    solver.run_briefly()
 
 
 def _refine(
@@ -358,9 +358,7 @@ def _refine(
     for number in range(most):
         before = model.distance
         model.find_behind(solver.amplitude)
-        found = refine_state(model, solver.amplitude, found, number + 1 >= least)
-        solver.amplitude = found.amplitude
-        solver.run(REFINEMENT_ITERATIONS, tick, AGAINST_DIM)
+        found = take_step(solver, found, robust=number + 1 >= least, tick=tick)
         earlier, moved = moved, model.distance - before
         far, points = _measure_step(solver, moved, found)
         if number + 1 >= least and far.sum() < LAST_STEP_SIGMAS**2 * points.sum():
@@ -409,9 +407,7 @@ def settle_surfaces(
     moved = np.zeros(apart.amplitude.size)
     for number in range(steps):
         before = apart.model.distance
-        step = refine_state(apart.model, apart.amplitude, step, instrument=False)
-        apart.amplitude = step.amplitude
-        apart.run(REFINEMENT_ITERATIONS, against_dim=AGAINST_DIM)
+        step = take_step(apart, step, instrument=False)
         earlier, moved = moved, apart.model.distance - before
         far, points = _measure_step(apart, moved, step)
         if far.sum() < LAST_STEP_SIGMAS**2 * points.sum():

@@ -22,6 +22,8 @@ from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
 from tofclip.camera.model import interpolate_linearly
 from tofclip.recovery.surfaces.amplitudes import (
+    AmplitudeSolver,
+    Tick,
     explain_by_amplitude,
     scale_amplitude,
     share_misfit,
@@ -382,7 +384,7 @@ def refine_state(
         covariance += PULL_SIGMAS**2 * np.outer(pull, pull)
 
     # 4. The step's length.
-    moved, free, rest = _take_step(model, amplitude, (error, excess, scale), names, newton, changes)
+    moved, free, rest = _go_ahead(model, amplitude, (error, excess, scale), names, newton, changes)
     numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
     own = [np.ix_(numbers == surface, numbers == surface) for surface in range(len(model.masks))]
     covariances = [covariance[block] for block in own]
@@ -391,7 +393,21 @@ def refine_state(
     return Refinement(covariances, moved, changes, steps, rest, free)
 
 
-def _take_step(
+def take_step(
+    solver: AmplitudeSolver,
+    earlier: Refinement | None = None,
+    robust: bool = False,
+    instrument: bool = True,
+    tick: Tick = lambda: None,
+) -> Refinement:
+    """Take a step as `refine_state` does, and amplitudes along."""
+    step = refine_state(solver.model, solver.amplitude, earlier, robust, instrument)
+    solver.amplitude = step.amplitude
+    solver.run_briefly(tick)
+    return step
+
+
+def _go_ahead(
     model: SurfaceModel,
     amplitude: Image,
     begun: tuple[Image, Image, Image],
