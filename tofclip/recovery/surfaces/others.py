@@ -91,12 +91,12 @@ def add_surfaces(solver: AmplitudeSolver, found: Returns, light: Image) -> Ampli
     patches = find_brightest_patches(lost, ray_length, model.row_m)
     if not patches:
         return solver
-    masks, _ = lay_out(patches, lost, light, model.row_m)
+    masks, amplitude = lay_out(patches, lost, light, model.row_m)
+    seen = np.zeros(masks.shape, np.float32)
+    seen[masks] = amplitude
     bodies, known = list_bodies(solver), len(model.masks)
-    for patch, mask in zip(patches, masks, strict=True):
-        seen = np.zeros(mask.shape, np.float32)
-        seen.ravel()[patch.pixels] = light.ravel()[patch.pixels]
-        bodies.append(Body(mask, seen, patch.basis, patch.coefficients))
+    for patch, mask, picture in zip(patches, masks, seen, strict=True):
+        bodies.append(Body(mask, picture, patch.basis, patch.coefficients))
     shading = np.pad(model.state.shading, ((0, len(patches)), (0, 0)))
     more = lay_bodies(solver, bodies, shading)
     more.run(START_ITERATIONS, against_dim=AGAINST_DIM)
