@@ -206,7 +206,10 @@ def _fit_ranges(
     solver, straightened = straighten_surfaces(solver)
     _approach_steep(solver, darkness)
     refinement, _ = _refine(solver, straightened, tick, least=MIN_REFINEMENTS, most=MIN_REFINEMENTS)
-    grown = grow_surfaces(part_bodies(add_surfaces(solver, *shown)))
+    grown = add_surfaces(solver, *shown)
+    if darkness <= DIM:  # ranges that follow the shot point by point follow noise otherwise
+        grown = part_bodies(grown)
+    grown = grow_surfaces(grown)
     if grown is not solver:
         solver = keep_lit(grown)
         refinement = refinement.cover(solver.model)
