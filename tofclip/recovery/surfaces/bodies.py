@@ -13,10 +13,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.recovery.surfaces.amplitudes import (
-    AmplitudeSolver,
-    share_misfit,
-)
+from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, share_misfit
 from tofclip.recovery.surfaces.creases import find_bodies
 from tofclip.recovery.surfaces.extents import LIT_SIGMAS, find_lit, find_steep, take_apart
 from tofclip.recovery.surfaces.patches import Patch

@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.amplitudes import (
     AmplitudeSolver,
     share_misfit,
@@ -55,17 +56,27 @@ def grow_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
             break
         grown = solver.cover(masks | further)
         grown.run_briefly()
-        model, light = grown.model, grown.model.render(grown.amplitude)
-        left, less = (model.image - one for one in (solver.model.render(solver.amplitude), light))
-        gained = share_misfit(model, grown.amplitude, light, model.weights * (left**2 - less**2))
-        new = further[model.masks] & (grown.amplitude > 0)
-        gain, points = (
-            np.bincount(model.surface[new], one, growing.size) for one in (gained[new], new[new])
-        )
-        growing &= gain > LEAST_GAIN * grown.variance * points
+        gain = measure_gain(solver, grown, further[grown.model.masks])
+        growing &= gain > LEAST_GAIN * grown.variance
         if growing.any():
             solver = grown.cover(masks | further & growing[:, np.newaxis, np.newaxis])
     return solver
+
+
+def measure_gain(
+    solver: AmplitudeSolver, further: AmplitudeSolver, new: NDArray[np.bool_]
+) -> FloatArray:
+    """By how much the misfit falls for each of the new points, (points,), that is lit, mean over each surface,
+    (surfaces,).
+    """
+    model, light = further.model, further.model.render(further.amplitude)
+    left, less = (model.image - one for one in (solver.model.render(solver.amplitude), light))
+    gained = share_misfit(model, further.amplitude, light, model.weights * (left**2 - less**2))
+    new = new & (further.amplitude > 0)
+    gain, points = (
+        np.bincount(model.surface[new], one, len(model.masks)) for one in (gained[new], new[new])
+    )
+    return np.asarray(gain / np.maximum(points, 1))
 
 
 def keep_lit(solver: AmplitudeSolver) -> AmplitudeSolver:

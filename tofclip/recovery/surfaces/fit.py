@@ -354,8 +354,8 @@ def _refine(
     least: int = 1,
     most: int = MAX_REFINEMENTS,
 ) -> tuple[Refinement, FloatArray]:
-    """Steps on ranges and instrument, at least so many, until they hardly move; the last one, and what more
-    would change of each point's range.
+    """Take Gauss-Newton steps on ranges and instrument, at least and at most so many, until one is short; return
+    the last one, and what more would change of each point's range, (points,), m.
     """
     model, moved = solver.model, np.zeros(solver.amplitude.size)
     for number in range(most):

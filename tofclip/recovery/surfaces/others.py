@@ -17,10 +17,9 @@ from tofclip.recovery.surfaces.amplitudes import (
     START_ITERATIONS,
     AmplitudeSolver,
     Tick,
-    share_misfit,
 )
 from tofclip.recovery.surfaces.bodies import Body, lay_bodies, list_bodies
-from tofclip.recovery.surfaces.extents import LEAST_GAIN, find_candidates
+from tofclip.recovery.surfaces.extents import LEAST_GAIN, find_candidates, measure_gain
 from tofclip.recovery.surfaces.patches import DIMMER_REACH_BINS, rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
 from tofclip.recovery.surfaces.shapes import Pixels
@@ -50,7 +49,7 @@ def find_others(
     """Return those of the frames' returns that no surface is near and that the whole shot shows, with
     surfaces and all other returns free to take over their light; and the light of all.
     """
-    others = find_beside(solver, found)
+    others = _find_beside(solver, found)
     if not len(others):
         return others, solver
     dark = np.zeros(len(others), np.float32)
@@ -81,7 +80,7 @@ def add_surfaces(solver: AmplitudeSolver, found: Returns, light: Image) -> Ampli
     frames, (rows, columns).
     """
     model, ray_length = solver.model, measure_rays(solver.model.camera)
-    lost = find_beside(solver, found)
+    lost = _find_beside(solver, found)
     lost = lost[~(lost.false_alarm > SURE_FALSE_ALARM)]
     for basis, coefficients in zip(model.bases, model.state.coefficients, strict=True):
         pixel = lost.y.astype(np.intp) * ray_length.shape[1] + lost.x
@@ -100,19 +99,15 @@ def add_surfaces(solver: AmplitudeSolver, found: Returns, light: Image) -> Ampli
     shading = np.pad(model.state.shading, ((0, len(patches)), (0, 0)))
     more = lay_bodies(solver, bodies, shading)
     more.run(START_ITERATIONS, against_dim=AGAINST_DIM)
-    lit = more.model.render(more.amplitude)
-    before, after = (model.image - one for one in (model.render(solver.amplitude), lit))
-    gained = share_misfit(more.model, more.amplitude, lit, model.weights * (before**2 - after**2))
-    surface = more.model.surface
-    gain, points = (np.bincount(surface, one, len(bodies)) for one in (gained, more.amplitude > 0))
-    kept = gain > LEAST_GAIN * solver.variance * points
-    if not kept[known:].any():
+    gain = measure_gain(solver, more, more.model.surface >= known)
+    kept = gain > LEAST_GAIN * solver.variance
+    if not kept.any():
         return solver
     kept[:known] = True
     return more.cover(more.model.masks & kept[:, np.newaxis, np.newaxis])
 
 
-def find_beside(solver: AmplitudeSolver, found: Returns) -> Returns:
+def _find_beside(solver: AmplitudeSolver, found: Returns) -> Returns:
     """Return those of the frames' returns that no surface is near."""
     model = solver.model
     chosen = find_candidates(solver, solver.measure_significance(), Detection.signal_to_noise)
