@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.recovery.surfaces.model import SurfaceModel
+from tofclip.recovery.surfaces.model import SurfaceModel, smooth_evenly
 from tofclip.recovery.surfaces.pulse import TINY, Image
 
 START_ITERATIONS, REFINEMENT_ITERATIONS = 25, 10  # of what is new, and of what has changed
@@ -82,7 +82,7 @@ class AmplitudeSolver:
         model = self.model
         rest = model.weights * (model.image - model.render(self.amplitude)) ** 2
         valid = (model.weights > 0).astype(np.float32)
-        around, seen = (scipy.ndimage.gaussian_filter(one, MISFIT_PX) for one in (rest, valid))
+        around, seen = (smooth_evenly(one, MISFIT_PX) for one in (rest, valid))
         return np.asarray(np.maximum(around / np.maximum(seen, TINY), np.float32(self.variance)))
 
     def measure_significance(self, variance: Image | None = None) -> Image:

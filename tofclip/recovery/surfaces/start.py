@@ -17,7 +17,12 @@ from tofclip.errors import InputError
 from tofclip.lidar import compute_ray_directions, depth
 from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver
 from tofclip.recovery.surfaces.creases import bend_patches
-from tofclip.recovery.surfaces.model import SMOOTHING_PX, SurfaceModel, compare_smoothed
+from tofclip.recovery.surfaces.model import (
+    SMOOTHING_PX,
+    SurfaceModel,
+    compare_smoothed,
+    smooth_evenly,
+)
 from tofclip.recovery.surfaces.patches import (
     MARGIN_PX,
     Patch,
@@ -220,7 +225,7 @@ def estimate_darkness(streak: Streak, frames: Frames) -> float:
         return 0.0
     image = streak.counts - np.float32(estimate_dark_level(streak.counts))
     variance = float(np.sum(noise.compute_variance(np.maximum(image, 0))))
-    signal = np.linalg.norm(scipy.ndimage.gaussian_filter(image, SMOOTHING_PX))
+    signal = np.linalg.norm(smooth_evenly(image, SMOOTHING_PX))
     # what is left of the variance of neighbours' mean
     return float(np.sqrt(variance / (4 * np.pi)) / SMOOTHING_PX / max(signal, LEAST_COUNT))
 
