@@ -197,10 +197,12 @@ class SurfaceModel(SurfacePoints):
         image = np.where(valid, self.image, self.render(amplitude))
         variance = valid / np.maximum(self.weights, TINY)
         longer = self.respond(replace(self.pulse, sigma=float(np.hypot(self.pulse.sigma, sigma))))
-        longer.image, around = (smooth_rows_evenly(one, sigma) for one in (image, variance))
+        longer.image, around = (
+            smooth_rows_evenly(np.asarray(one, np.float32), sigma) for one in (image, variance)
+        )
         # variance of one measurement over that of a weighted mean of independent ones
         averaged = np.float32(2 * np.sqrt(np.pi) * sigma)
-        longer.weights = valid * averaged / np.maximum(around, TINY)
+        longer.weights = np.asarray(valid * averaged / np.maximum(around, TINY), np.float32)
         return longer
 
     def blur(self, sigma_px: float) -> Self:
