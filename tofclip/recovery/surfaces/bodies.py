@@ -28,7 +28,8 @@ FOLLOWED_BINS = 0.25  # ranges that follow the shot are that much nearer than th
 BODY_MARGIN_PX = 3  # how far one body may reach into the next
 # Steps until bodies are compared with the surface that they were taken for, and how often, as they may be several
 # again; by how much the misfit has to fall, in the noise's variance, for each number that bodies have more than the
-# surface, or half of their own (4 to 30 where balls, leaves and tables were one, 45 to 2000 where bodies were several).
+# surface, or a quarter of their own (4 to 30 where balls, leaves and tables were one, 45 to 2000 where there were
+# several).
 BODY_STEPS, BODY_ROUNDS, BODY_GAIN = 2, 3, 40.0
 
 
@@ -117,7 +118,7 @@ def _try_bodies(solver: AmplitudeSolver, found: Sequence[list[Body]]) -> list[li
     for whole, part, begun in zip(list_bodies(solver), model.parts, found, strict=True):
         parts = [next(bodies) for _ in begun]
         own = sum(body.coefficients.size for body in parts)
-        freedom = max(own - whole.coefficients.size, own / 2)
+        freedom = max(own - whole.coefficients.size, own / 4)
         better = float(gained[part].sum()) > BODY_GAIN * solver.variance * freedom
         kept.append(parts if better else [whole])
     return kept

@@ -71,13 +71,15 @@ def _try_label(patch: Patch, label: Pixels, bin_m: float) -> tuple[list[Patch], 
     return parts, float(np.median(_list_distances(parts)))
 
 
-def find_bodies(patch: Patch, bin_m: float) -> list[Patch]:
-    """Return the bodies, all of second order, of which a patch may consist, or the patch."""
+def find_bodies(patch: Patch, bin_m: float, most: float = TRIED_FRACTION) -> list[Patch]:
+    """Return the bodies, all of second order, of which a patch may consist, or the patch. `most`: what may be
+    left of its distances. The parts, once there are some, are parted where that is certain.
+    """
     patch = _make_round(patch, bin_m)
     error = _measure_distance([patch], bin_m)
     if error < BEND_BINS * bin_m or patch.pixels.size < 2 * MIN_PATCH_PX:
         return [patch]
-    best, least = [patch], TRIED_FRACTION * error
+    best, least = [patch], most * error
     for find in _find_valleys, _find_off, _find_creases:
         for label in np.atleast_2d(find(patch, bin_m)):
             plain = _take_parts(patch, label)
@@ -88,7 +90,9 @@ def find_bodies(patch: Patch, bin_m: float) -> list[Patch]:
                 best, least = parts, left
         if least < PARTED_FRACTION * error:
             break
-    return best
+    if len(best) == 1:
+        return best
+    return [body for part in best for body in find_bodies(part, bin_m, PARTED_FRACTION)]
 
 
 def _take_parts(patch: Patch, label: Pixels) -> list[Patch]:

@@ -21,8 +21,9 @@ from tofclip.recovery.surfaces.patches import (
 from tofclip.recovery.surfaces.pulse import TINY, Image
 from tofclip.recovery.surfaces.shapes import Pixels
 
-# Of a surface's lit points: that many within as many bins of another's may be the other's
-DOUBLE_FRACTION, DOUBLE_BINS = 0.2, 7.0
+# Of a surface's lit points: that many within as many bins of another's, and what as many pixels of that span, may
+# be the other's
+DOUBLE_FRACTION, DOUBLE_BINS, DOUBLE_PX = 0.2, 7.0, 3.0
 MIN_BRIGHTNESS_FRACTION = 0.1  # of the surface's usual brightness: fainter is not looked at
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
@@ -172,9 +173,8 @@ def _list_doubles(solver: AmplitudeSolver) -> list[tuple[int, int]]:
     lit = np.flatnonzero(solver.measure_significance() > LIT_SIGMAS)
     order, rank = rank_within_pixels(model.pixel[lit], model.distance[lit])
     nearer, farther = lit[order[:-1]], lit[order[1:]]
-    near = (rank[1:] > 0) & (
-        model.distance[farther] - model.distance[nearer] < DOUBLE_BINS * model.row_m
-    )
+    apart = DOUBLE_BINS * model.row_m + DOUBLE_PX * np.hypot(*model.compute_slopes())[farther]
+    near = (rank[1:] > 0) & (model.distance[farther] - model.distance[nearer] < apart)
     size = np.bincount(model.surface[lit], minlength=len(model.parts))
     shared = np.zeros((size.size, size.size))
     np.add.at(shared, (model.surface[nearer[near]], model.surface[farther[near]]), 1)

@@ -79,7 +79,7 @@ LAST_STEP_SIGMAS = 0.15
 SURE_TAIL = 1.2
 # After a longer one of its own a surface goes on alone, for as many steps, more after the last one, if each
 # leads on that far where the one before led; others are at their end, or nowhere.
-LONG_STEP_SIGMAS, SETTLING_STEPS, LAST_SETTLING_STEPS, GOES_ON = 0.7, 3, 8, 0.5
+LONG_STEP_SIGMAS, SETTLING_STEPS, LAST_SETTLING_STEPS, GOES_ON = 0.7, 3, 16, 0.5
 MOST_ONWARD = 0.75  # of a step, how far the next may be thought to lead
 LONGER_PULSES = (
     12.0,
@@ -152,8 +152,9 @@ def _fit_returns(
 
     # 4. Amplitudes, and the pulse as they show it.
     solver.run(PULSE_ITERATIONS, tick, AGAINST_DIM)
-    solver = _measure_pulse(solver)
-    require_pulse(solver.model.pulse)
+    # in little light a part of the noise comes late, 0.5 to 0.8 of it
+    solver = _measure_pulse(solver, max(LEAST_TAIL, darkness))
+    require_pulse(solver.model.pulse, darkness)
     solver.run(START_ITERATIONS - PULSE_ITERATIONS, tick, AGAINST_DIM)
     limit = np.hypot(MAX_UNEXPLAINED, darkness)
     if solver.model.unexplained(solver.amplitude) > limit:

@@ -238,9 +238,9 @@ def call_dark(darkness: float) -> InputError:
     )
 
 
-def require_pulse(pulse: ShotPulse) -> None:
+def require_pulse(pulse: ShotPulse, darkness: float) -> None:
     """Refuse a shot whose light follows no pulse."""
-    if pulse.tail_share > MAX_TAIL_SHARE:
+    if pulse.tail_share > np.hypot(MAX_TAIL_SHARE, darkness):
         late = 100 * pulse.tail_share
         raise _refuse(f"{late:.0f} % of each pixel's light comes long after its peak")
 
