@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, share_misfit
-from tofclip.recovery.surfaces.creases import find_bodies
+from tofclip.recovery.surfaces.creases import divide_further, find_bodies
 from tofclip.recovery.surfaces.extents import LIT_SIGMAS, find_lit, find_steep, take_apart
 from tofclip.recovery.surfaces.patches import Patch
 from tofclip.recovery.surfaces.pulse import Image
@@ -46,38 +46,44 @@ def part_bodies(solver: AmplitudeSolver) -> AmplitudeSolver:
     """Give bodies that touch at one range surfaces of their own, where these explain the shot better."""
     doubtful: Sequence[int] = range(len(solver.model.masks))
     for _ in range(BODY_ROUNDS):
-        apart = take_apart(solver, doubtful)
-        found = _find_bodies(apart)
-        if not found:
-            break
-        better = _try_bodies(take_apart(apart, list(found)), list(found.values()))
-        surfaces = [doubtful[number] for number in found]
-        solver, doubtful = _replace(solver, dict(zip(surfaces, better, strict=True)))
+        apart, better = take_apart(solver, doubtful), dict[int, list[Body]]()
+        # a few bodies first: where these explain it no better, more of them may
+        for found in _find_bodies(apart):
+            left = {surface: parts for surface, parts in found.items() if surface not in better}
+            if left:
+                better |= _try_bodies(take_apart(apart, list(left)), left)
+        surfaces = {doubtful[surface]: parts for surface, parts in better.items()}
+        solver, doubtful = _replace(solver, surfaces)
         if not doubtful:
             break
     return solver
 
 
-def _find_bodies(solver: AmplitudeSolver) -> dict[int, list[Body]]:
-    """The bodies of which surfaces may consist, of those that may be several."""
+def _find_bodies(solver: AmplitudeSolver) -> tuple[dict[int, list[Body]], dict[int, list[Body]]]:
+    """The bodies of which surfaces may consist, of those that may be several; and those of which they may consist
+    if these are several in turn.
+    """
     model = solver.model
     rest, ray_length = model.image - model.render(solver.amplitude), measure_rays(model.camera)
     shifts = measure_local_shifts(model, solver.amplitude, rest) / SHIFT_SHOWN
     variance = solver.estimate_local_variance()
     distance = model.distance + follow_local_shifts(solver, rest, variance, shifts)
     lit = find_lit(solver, LIT_SIGMAS, BODY_FRACTION)[model.masks]
-    found, wholes = {}, list_bodies(solver)
+    few, more, wholes = dict[int, list[Body]](), dict[int, list[Body]](), list_bodies(solver)
     # where a pixel has no one range, returns do not lie on any surface
     flat = ~find_steep(solver) | [not basis.is_quadratic for basis in model.bases]
     for surface, part in enumerate(model.parts):
         own = part.start + np.flatnonzero(lit[part])
         if own.size and flat[surface]:
-            deviation = np.full(own.size, TINY)
+            deviation, bin_m = np.full(own.size, TINY), FOLLOWED_BINS * model.row_m
             whole = Patch.fit(model.pixel[own], distance[own], deviation, ray_length)
-            patches = find_bodies(whole, FOLLOWED_BINS * model.row_m)
+            patches = find_bodies(whole, bin_m)
             if len(patches) > 1:
-                found[surface] = _divide(wholes[surface], patches)
-    return found
+                few[surface] = _divide(wholes[surface], patches)
+                further = divide_further(patches, bin_m)
+                if len(further) > len(patches):
+                    more[surface] = _divide(wholes[surface], further)
+    return few, more
 
 
 def _divide(whole: Body, patches: Sequence[Patch]) -> list[Body]:
@@ -99,11 +105,11 @@ def _divide(whole: Body, patches: Sequence[Patch]) -> list[Body]:
     return bodies
 
 
-def _try_bodies(solver: AmplitudeSolver, found: Sequence[list[Body]]) -> list[list[Body]]:
-    """Take steps on surfaces, and on the bodies of each; return what of both explains the shot better, bodies if
-    they are worth their freedom.
+def _try_bodies(solver: AmplitudeSolver, found: Mapping[int, list[Body]]) -> dict[int, list[Body]]:
+    """Take steps on surfaces, and on the bodies of each, by the surfaces' numbers; return the bodies that explain
+    the shot so much better that they are worth their freedom.
     """
-    trial, _ = _replace(solver, dict(enumerate(found)))
+    trial, _ = _replace(solver, dict(enumerate(found.values())))
     light, fallen = solver.model.render(solver.amplitude), np.zeros_like(solver.model.image)
     for one, sign in ((solver, 1), (trial, -1)):
         one.run_briefly()
@@ -114,14 +120,15 @@ def _try_bodies(solver: AmplitudeSolver, found: Sequence[list[Body]]) -> list[li
         fallen += sign * step.rest**2
     model, bodies = solver.model, iter(list_bodies(trial))
     gained = share_misfit(model, solver.amplitude, light, model.weights * fallen)
-    kept = []
-    for whole, part, begun in zip(list_bodies(solver), model.parts, found, strict=True):
+    better = {}
+    wholes = zip(list_bodies(solver), model.parts, found.items(), strict=True)
+    for whole, part, (surface, begun) in wholes:
         parts = [next(bodies) for _ in begun]
         own = sum(body.coefficients.size for body in parts)
         freedom = max(own - whole.coefficients.size, own / 4)
-        better = float(gained[part].sum()) > BODY_GAIN * solver.variance * freedom
-        kept.append(parts if better else [whole])
-    return kept
+        if float(gained[part].sum()) > BODY_GAIN * solver.variance * freedom:
+            better[surface] = parts
+    return better
 
 
 def list_bodies(solver: AmplitudeSolver) -> list[Body]:

@@ -4,6 +4,7 @@ creases, and where most of it is one surface and the rest off it.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -73,7 +74,7 @@ def _try_label(patch: Patch, label: Pixels, bin_m: float) -> tuple[list[Patch], 
 
 def find_bodies(patch: Patch, bin_m: float, most: float = TRIED_FRACTION) -> list[Patch]:
     """Return the bodies, all of second order, of which a patch may consist, or the patch. `most`: what may be
-    left of its distances. The parts, once there are some, are parted where that is certain.
+    left of its distances.
     """
     patch = _make_round(patch, bin_m)
     error = _measure_distance([patch], bin_m)
@@ -90,9 +91,15 @@ def find_bodies(patch: Patch, bin_m: float, most: float = TRIED_FRACTION) -> lis
                 best, least = parts, left
         if least < PARTED_FRACTION * error:
             break
-    if len(best) == 1:
-        return best
-    return [body for part in best for body in find_bodies(part, bin_m, PARTED_FRACTION)]
+    return best
+
+
+def divide_further(bodies: list[Patch], bin_m: float) -> list[Patch]:
+    """Return the bodies of which these may consist in turn, as far as that is certain."""
+    divided = [find_bodies(body, bin_m, PARTED_FRACTION) for body in bodies]
+    if len(divided) == sum(map(len, divided)):
+        return bodies
+    return divide_further(list(itertools.chain.from_iterable(divided)), bin_m)
 
 
 def _take_parts(patch: Patch, label: Pixels) -> list[Patch]:
