@@ -47,9 +47,10 @@ Result = TypeVar("Result")
 Shape = tuple[SmoothBasis, FloatArray]  # of a surface's inverse depth, with its coefficients
 
 SLIT_PIXELS = 4
-# Rows that a part of a pixel spans where a surface is turned far, and parts along a side at most:
-# a pulse of a row or more does not tell so narrow a ramp from an instant
-PART_ROWS, MAX_PARTS = 1.5, 6
+# Rows that a part of a pixel spans where a surface is turned far, those from which on a side has two parts, and parts
+# along a side at most. A pulse of a row or more hardly tells so narrow a ramp from an instant, but a ball whose middle
+# was one was 0.1 mm too near there, and too far about it.
+PART_ROWS, LEVEL_ROWS, MAX_PARTS = 1.5, 0.5, 6
 LEAST_FILLED = 0.1  # of a pixel's side, by a surface that ends in it
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
@@ -119,7 +120,9 @@ class Places(NamedTuple):
         """
         filled = 1 - 2 * np.abs(aside)
         slopes = slopes * filled
-        counts = np.clip(np.ceil(np.abs(slopes) / row_m / PART_ROWS), 1, MAX_PARTS).astype(np.intp)
+        rows = np.abs(slopes) / row_m
+        least = 1 + (rows > LEVEL_ROWS)
+        counts = np.clip(np.ceil(rows / PART_ROWS), least, MAX_PARTS).astype(np.intp)
         total = counts[0] * counts[1]
         point = np.repeat(np.arange(distance.size), total)
         starts = np.concatenate([[0], np.cumsum(total)])
