@@ -383,10 +383,13 @@ class SurfaceModel(SurfacePoints):
                 kernel = self.pulse.extend(self.make_kernel(view, variance=0.0)) ** 2
                 slit_shares = slit_shares**2
                 lags = np.arange(kernel.size) - kernel.size // 2
-                # of a square pixel on those of the slit
-                slit_px = np.sqrt((2 + np.tan(self.camera.angles[view]) ** 2) / 12)
+                # of a square pixel on those of the slit, and of its parts, which lie beside each other there
+                square = np.tan(self.camera.angles[view]) ** 2
+                slit_px = np.sqrt((2 + square) / 12)
                 blurred = np.float32(slit_px / np.hypot(slit_px, self.blur_px))
-                shares = shares**2 * self.places.overlap * blurred
+                overlap, (wide, high) = self.places.overlap, self.places.narrower
+                beside = 1 - overlap * (1 - np.sqrt(1 - (wide + high * square) / (2 + square)))
+                shares = (shares**2 * overlap * blurred * beside).astype(np.float32)
             light = np.zeros((1, *place.shape), np.float32)
             below = place.first_row - above
             lines = -lags, place.reached_rows, below, place.first_column

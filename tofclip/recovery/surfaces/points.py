@@ -105,6 +105,7 @@ class Places(NamedTuple):
     share: Image  # (places,), of its point's light
     # (points,), sum of squares of what parts have in common, over that of the pulse alone
     overlap: Image
+    narrower: FloatArray  # (2, points), squared sides of the whole less those of a part, px^2
 
     @classmethod
     def split(
@@ -131,9 +132,9 @@ class Places(NamedTuple):
         offset = (np.stack([right, down]) + 0.5) * size - 0.5 * filled[:, point] + aside[:, point]
         away = np.sum(offset * (slopes / filled)[:, point], axis=0)
         ramp = np.hypot(*slopes) / row_m / pulse_rows  # pulses that a pixel spans
-        overlap = (1 / np.sqrt(1 + ramp**2 / 6)).astype(np.float32)
-        share = (1 / total[point]).astype(np.float32)
-        return cls(point, starts, offset, size, distance[point] + away, share, overlap)
+        overlap = (1 / np.sqrt(1 + ramp**2 / 12)).astype(np.float32)
+        share, narrower = (1 / total[point]).astype(np.float32), filled**2 * (1 - 1 / counts**2)
+        return cls(point, starts, offset, size, distance[point] + away, share, overlap, narrower)
 
     def choose(self, distance: FloatArray, light: FloatArray) -> Places:
         """Return those that have light, (places,), at such distances."""
