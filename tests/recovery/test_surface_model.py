@@ -186,16 +186,23 @@ def test_the_adjoint_matches(shot, blur_px: float):
     assert there == pytest.approx(float(np.vdot(x.astype(np.float64), model.gather(y))), rel=1e-4)
 
 
-@pytest.mark.parametrize("blur_px", [0.0, 1.5])
-def test_squares_of_the_entries_are_those_of_single_points(shot, blur_px: float):
-    model = make_model(shot.streak).blur(blur_px)
+def compare_squares(model, points):
+    """Sum of squares of each point's own image, over what the model gathers of squares."""
     information = model.gather(np.ones_like(model.image), squared=True)
-    for point in (3, 200, 700):
-        alone = np.zeros(model.surface.size, np.float32)
-        alone[point] = 1
-        # what is between rows and columns is exact only on average, and a blurred pixel is taken for a Gaussian
-        near = 0.1 if blur_px else 0.05
-        assert np.sum(model.render(alone) ** 2) == pytest.approx(information[point], rel=near)
+    seen = [
+        model.render((np.arange(model.surface.size) == one).astype(np.float32)) for one in points
+    ]
+    return np.array([np.sum(one**2) for one in seen]) / information[points]
+
+
+# Where a point lies between rows and columns decides what of it is in one pixel: sums of squares are exact only on
+# average, and a blurred pixel is taken for a Gaussian. Single points of two parts are off by up to 0.15.
+@pytest.mark.parametrize(("blur_px", "near"), [(0.0, 0.04), (1.5, 0.08)])
+def test_squares_of_the_entries_are_those_of_single_points(shot, blur_px: float, near: float):
+    model = make_model(shot.streak).blur(blur_px)
+    ratios = compare_squares(model, np.arange(3, model.surface.size, 7))
+    assert np.mean(ratios) == pytest.approx(1, abs=near)
+    assert np.max(np.abs(ratios - 1)) < 0.2
 
 
 def test_squares_of_entries_hold_what_a_view_sees_of_a_hidden_point(shot):
@@ -204,12 +211,10 @@ def test_squares_of_entries_hold_what_a_view_sees_of_a_hidden_point(shot):
     shaded = model.state.copy()
     shaded.shading[1] = [-0.7, -0.4, 0.1, 0.6, 0.5, -0.3, 0.2]
     model.place(shaded)
-    information = model.gather(np.ones_like(model.image), squared=True)
-    hidden = np.flatnonzero(model.behind)
-    for point in hidden[[5, hidden.size // 2, -5]]:
-        alone = np.zeros(model.surface.size, np.float32)
-        alone[point] = 1
-        assert np.sum(model.render(alone) ** 2) == pytest.approx(information[point], rel=0.05)
+    ratios = compare_squares(model, np.flatnonzero(model.behind)[::5])
+    # some views see more of it than others: fewer places count
+    assert np.mean(ratios) == pytest.approx(1, abs=0.07)
+    assert np.max(np.abs(ratios - 1)) < 0.2
 
 
 @pytest.mark.parametrize("sides", [(1.0, 1.0), (0.25, 1.0), (0.5, 0.2)])
