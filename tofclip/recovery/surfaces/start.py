@@ -240,7 +240,9 @@ def call_dark(darkness: float) -> InputError:
 
 def require_pulse(pulse: ShotPulse, darkness: float) -> None:
     """Refuse a shot whose light follows no pulse."""
-    if pulse.tail_share > np.hypot(MAX_TAIL_SHARE, darkness):
+    # noise comes late as well; where it is more than surfaces may leave, the shot is too dark for them
+    noise = darkness if darkness <= MAX_UNEXPLAINED else 0.0
+    if pulse.tail_share > np.hypot(MAX_TAIL_SHARE, noise):
         late = 100 * pulse.tail_share
         raise _refuse(f"{late:.0f} % of each pixel's light comes long after its peak")
 
