@@ -53,6 +53,7 @@ from tofclip.recovery.surfaces.start import (
     DIM,
     MAX_UNEXPLAINED,
     SURE_FALSE_ALARM,
+    TOO_DARK,
     call_dark,
     estimate_darkness,
     find_brightest_patches,
@@ -128,14 +129,16 @@ def fit_surfaces(
     # 1. Frames by a fast method, whose returns are a picture of ranges. The model explains what was
     # measured: corrections come when its own returns are listed.
     found = depth(frames, frames.camera.replace(range_calibration=None))
+    darkness = estimate_darkness(streak, frames)
+    if darkness > TOO_DARK:
+        raise call_dark(darkness)
     try:
         tick = partial(progress, frames.times.size)
-        return _fit_returns(found, streak, frames, weight, iterations, tick)
+        return _fit_returns(found, streak, frames, weight, iterations, darkness, tick)
     except InputError as fault:
-        dark = estimate_darkness(streak, frames)
-        if dark <= MAX_UNEXPLAINED:
+        if darkness <= MAX_UNEXPLAINED:
             raise
-        raise call_dark(dark) from fault
+        raise call_dark(darkness) from fault
 
 
 def _fit_returns(
@@ -144,10 +147,10 @@ def _fit_returns(
     frames: Frames,
     weight: float,
     iterations: int,
+    darkness: float,
     tick: Tick,
 ) -> SurfaceFit:
-    """Fit the surfaces that returns show."""
-    darkness = estimate_darkness(streak, frames)
+    """Fit the surfaces that returns show. `darkness`: of `estimate_darkness`."""
     solver = find_surfaces(found, streak, frames, weight, darkness)
 
     # 4. Amplitudes, and the pulse as they show it.

@@ -50,6 +50,7 @@ MIN_SURFACE_SHARE = 0.7
 # not where the surfaces are. Surfaces leave 0.02 to 0.22, 0.3 where frames see things beside them, and
 # recorded relay walls 0.2 to 0.5. Smoke's first light looks like one surface, but only the first.
 MAX_UNEXPLAINED = 0.4
+TOO_DARK = 0.8  # noise, of a shot's signal: what surfaces are found there are noise's (0.9 of 5 photons, 0.6 of 15)
 # Of what frames leave unexplained, and of what surfaces left in the shot before: from there on the
 # surfaces are not the shot's.
 CHANGED_RATIO = 1.25
