@@ -52,10 +52,10 @@ def part_bodies(solver: AmplitudeSolver) -> AmplitudeSolver:
             left = {surface: parts for surface, parts in found.items() if surface not in better}
             if left:
                 better |= _try_bodies(take_apart(apart, list(left)), left)
+        if not better:
+            break
         surfaces = {doubtful[surface]: parts for surface, parts in better.items()}
         solver, doubtful = _replace(solver, surfaces)
-        if not doubtful:
-            break
     return solver
 
 
