@@ -48,9 +48,9 @@ Shape = tuple[SmoothBasis, FloatArray]  # of a surface's inverse depth, with its
 
 SLIT_PIXELS = 4
 # Rows that a part of a pixel spans where a surface is turned far, those from which on a side has two parts, and parts
-# along a side at most. A pulse of a row or more hardly tells so narrow a ramp from an instant, but a ball whose middle
-# was one was 0.1 mm too near there, and too far about it.
-PART_ROWS, LEVEL_ROWS, MAX_PARTS = 1.5, 0.5, 6
+# along a side at most. A pulse of a row or more hardly tells so narrow a ramp from an instant; but a pixel of a ball is
+# not where its middle is: with one part in the middle of the ball it was 0.1 mm too near there, and too far about it.
+PART_ROWS, LEVEL_ROWS, BENT_ROWS, MAX_PARTS = 1.5, 1.0, 0.5, 6
 LEAST_FILLED = 0.1  # of a pixel's side, by a surface that ends in it
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
@@ -113,16 +113,18 @@ class Places(NamedTuple):
         distance: FloatArray,
         slopes: FloatArray,
         aside: FloatArray,
+        bent: NDArray[np.bool_],
         pulse_rows: float,
         row_m: float,
     ) -> Places:
         """Split points by the slopes of their surfaces, m per pixel; `aside`: where the middle of their
-        light is, px from the pixel's; both (2, points).
+        light is, px from the pixel's; both (2, points); `bent` (points,): those
+        of surfaces of second order in space.
         """
         filled = 1 - 2 * np.abs(aside)
         slopes = slopes * filled
         rows = np.abs(slopes) / row_m
-        least = 1 + (rows > LEVEL_ROWS)
+        least = 1 + (rows > np.where(bent, BENT_ROWS, LEVEL_ROWS))
         counts = np.clip(np.ceil(rows / PART_ROWS), least, MAX_PARTS).astype(np.intp)
         total = counts[0] * counts[1]
         point = np.repeat(np.arange(distance.size), total)
@@ -275,8 +277,9 @@ class SurfacePoints:
         # of each surface, (points, coefficients), of the inverse depths
         self.derivatives = [basis.differentiate(f, c) for basis, f, c in shapes]
         self.distance = np.asarray(self.ray_length / np.maximum(inverse, MIN_INVERSE_DEPTH))
+        slopes, bent = self.compute_slopes(), np.isin(self.surface, list(self._list_quadrics()))
         self.places = Places.split(
-            self.distance, self.compute_slopes(), self.aside, self.pulse.sigma, self.row_m
+            self.distance, slopes, self.aside, bent, self.pulse.sigma, self.row_m
         )
         self._follow_limbs()
         # (views, outer points), the fraction by which each view sees more or less of a point in the
@@ -295,6 +298,10 @@ class SurfacePoints:
         )
         self.footprints = list(itertools.chain.from_iterable(spread))
 
+    def _list_quadrics(self) -> dict[int, QuadricBasis]:
+        """Surfaces of second order in space, by number."""
+        return {k: one for k, one in enumerate(self.bases) if isinstance(one, QuadricBasis)}
+
     def _follow_limbs(self) -> None:
         """Put parts of pixels where surfaces of second order are, as bright as they face the camera, and leave
         out those beyond a limb: there a pixel spans so much range that no line follows it. A point is where
@@ -303,7 +310,7 @@ class SurfacePoints:
         places, size = self.places, self.distance.size
         # of each point, how much of its light turning away leaves, and whether its surface ends in it or before
         self.facing, self.at_limb = np.ones(size), np.zeros(size, bool)
-        curved = {k: one for k, one in enumerate(self.bases) if isinstance(one, QuadricBasis)}
+        curved = self._list_quadrics()
         if not curved:
             return
         distance = places.distance.copy()
