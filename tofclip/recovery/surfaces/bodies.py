@@ -1,10 +1,11 @@
-"""Which surface is several, as the whole shot decides: bodies that touch at one range, which the returns of frames
-do not tell from one. Where they may part is looked for in ranges that follow the shot point by point.
+"""Which surface is several, and which are one, as the whole shot decides: bodies that touch at one range, which the
+returns of frames do not tell from one. Where they may part is looked for in ranges that follow the shot point by point.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, share_misfit
-from tofclip.recovery.surfaces.creases import divide_further, find_bodies
 from tofclip.recovery.surfaces.extents import LIT_SIGMAS, find_lit, find_steep, take_apart
+from tofclip.recovery.surfaces.growing import find_bodies
 from tofclip.recovery.surfaces.patches import Patch
 from tofclip.recovery.surfaces.pulse import Image
 from tofclip.recovery.surfaces.ranges import take_step
@@ -31,6 +32,12 @@ BODY_MARGIN_PX = 3  # how far one body may reach into the next
 # surface, or a quarter of their own (4 to 30 where balls, leaves and tables were one, 45 to 2000 where there were
 # several).
 BODY_STEPS, BODY_ROUNDS, BODY_GAIN = 2, 3, 40.0
+FINER = (0.75, 1.25)  # ever more bodies are looked for, and those kept that are worth most
+# Surfaces are tried alone, and those together whose ranges differ by less where they touch, if they are few.
+TOUCHING_ROWS, MOST_MEMBERS = (0.0, 3.0), 6
+
+
+Group = tuple[int, ...]  # numbers of surfaces
 
 
 class Body(NamedTuple):
@@ -42,26 +49,54 @@ class Body(NamedTuple):
     coefficients: FloatArray
 
 
+class Trial(NamedTuple):
+    """Bodies that may be in place of a group of surfaces."""
+
+    gain: float  # by how much more they explain of the shot than their freedom is worth
+    group: Group
+    bodies: list[Body]
+
+
 def part_bodies(solver: AmplitudeSolver) -> AmplitudeSolver:
-    """Give bodies that touch at one range surfaces of their own, where these explain the shot better."""
-    doubtful: Sequence[int] = range(len(solver.model.masks))
+    """Give bodies that touch at one range surfaces of their own, where these explain the shot better than the
+    surfaces that there are: of one, or of some that touch.
+    """
+    doubtful = set(range(len(solver.model.masks)))
     for _ in range(BODY_ROUNDS):
-        apart, better = take_apart(solver, doubtful), dict[int, list[Body]]()
-        # a few bodies first: where these explain it no better, more of them may
-        for found in _find_bodies(apart):
-            left = {surface: parts for surface, parts in found.items() if surface not in better}
-            if left:
-                better |= _try_bodies(take_apart(apart, list(left)), left)
+        patches, trials = _follow(solver), list[Trial]()
+        for rows in TOUCHING_ROWS:
+            groups = _list_groups(patches, rows * solver.model.row_m)
+            left = [group for group in groups if doubtful & set(group)]
+            for finer in FINER:
+                if found := _find_bodies(solver, patches, left, finer):
+                    trials += _try_bodies(solver, found)
+        better = dict[Group, list[Body]]()
+        for trial in sorted(trials, key=lambda one: -one.gain):
+            taken = set(itertools.chain.from_iterable(better))
+            if trial.gain > 0 and not taken & set(trial.group):
+                better[trial.group] = trial.bodies
         if not better:
             break
-        surfaces = {doubtful[surface]: parts for surface, parts in better.items()}
-        solver, doubtful = _replace(solver, surfaces)
+        solver, doubtful = _replace(solver, better)
     return solver
 
 
-def _find_bodies(solver: AmplitudeSolver) -> tuple[dict[int, list[Body]], dict[int, list[Body]]]:
-    """The bodies of which surfaces may consist, of those that may be several; and those of which they may consist
-    if these are several in turn.
+def _list_groups(patches: Mapping[int, Patch], apart: float) -> list[Group]:
+    """Surfaces that touch at ranges that differ by less, m; without that each alone."""
+    if not apart:
+        return [(one,) for one in patches]
+    numbers, every = list(patches), list(patches.values())
+    beside = np.zeros((len(numbers),) * 2, bool)
+    for number, patch in enumerate(every):
+        beside[number, patch.find_touching(every, apart)] = True
+    count, label = scipy.sparse.csgraph.connected_components(beside, directed=False)
+    groups = [tuple(numbers[k] for k in np.flatnonzero(label == one)) for one in range(count)]
+    return [group for group in groups if 1 < len(group) <= MOST_MEMBERS]
+
+
+def _follow(solver: AmplitudeSolver) -> dict[int, Patch]:
+    """The lit points of surfaces, by number, at ranges that follow the shot point by point. Where a pixel has no one
+    range these do not lie on any surface.
     """
     model = solver.model
     rest, ray_length = model.image - model.render(solver.amplitude), measure_rays(model.camera)
@@ -69,21 +104,35 @@ def _find_bodies(solver: AmplitudeSolver) -> tuple[dict[int, list[Body]], dict[i
     variance = solver.estimate_local_variance()
     distance = model.distance + follow_local_shifts(solver, rest, variance, shifts)
     lit = find_lit(solver, LIT_SIGMAS, BODY_FRACTION)[model.masks]
-    few, more, wholes = dict[int, list[Body]](), dict[int, list[Body]](), list_bodies(solver)
-    # where a pixel has no one range, returns do not lie on any surface
     flat = ~find_steep(solver) | [not basis.is_quadratic for basis in model.bases]
+    patches = dict[int, Patch]()
     for surface, part in enumerate(model.parts):
         own = part.start + np.flatnonzero(lit[part])
         if own.size and flat[surface]:
-            deviation, bin_m = np.full(own.size, TINY), FOLLOWED_BINS * model.row_m
-            whole = Patch.fit(model.pixel[own], distance[own], deviation, ray_length)
-            patches = find_bodies(whole, bin_m)
-            if len(patches) > 1:
-                few[surface] = _divide(wholes[surface], patches)
-                further = divide_further(patches, bin_m)
-                if len(further) > len(patches):
-                    more[surface] = _divide(wholes[surface], further)
-    return few, more
+            returns = model.pixel[own], distance[own], np.full(own.size, TINY), ray_length
+            shape = model.bases[surface], model.state.coefficients[surface]
+            patches[surface] = Patch(*returns, *shape)
+    return patches
+
+
+def _find_bodies(
+    solver: AmplitudeSolver, patches: Mapping[int, Patch], groups: Iterable[Group], finer: float
+) -> dict[Group, list[Body]]:
+    """The bodies of which groups of surfaces may consist, of those that may be others. `patches`: of `_follow`;
+    `finer`: as if their ranges were that much nearer to bodies.
+    """
+    bin_m, bodies = FOLLOWED_BINS * solver.model.row_m / finer, list_bodies(solver)
+    found = dict[Group, list[Body]]()
+    for group in groups:
+        if parts := find_bodies([patches[one] for one in group], bin_m):
+            found[group] = _divide(_unite([bodies[one] for one in group]), parts)
+    return found
+
+
+def _unite(bodies: Sequence[Body]) -> Body:
+    """The first of some bodies where all are."""
+    mask = np.any([one.mask for one in bodies], axis=0)
+    return bodies[0]._replace(mask=mask, light=np.sum([one.light for one in bodies], axis=0))
 
 
 def _divide(whole: Body, patches: Sequence[Patch]) -> list[Body]:
@@ -105,30 +154,32 @@ def _divide(whole: Body, patches: Sequence[Patch]) -> list[Body]:
     return bodies
 
 
-def _try_bodies(solver: AmplitudeSolver, found: Mapping[int, list[Body]]) -> dict[int, list[Body]]:
-    """Take steps on surfaces, and on the bodies of each, by the surfaces' numbers; return the bodies that explain
-    the shot so much better that they are worth their freedom.
-    """
-    trial, _ = _replace(solver, dict(enumerate(found.values())))
-    light, fallen = solver.model.render(solver.amplitude), np.zeros_like(solver.model.image)
-    for one, sign in ((solver, 1), (trial, -1)):
+def _try_bodies(solver: AmplitudeSolver, found: Mapping[Group, list[Body]]) -> list[Trial]:
+    """Take steps on surfaces, and on the bodies that may be in place of each group of them."""
+    members = sorted(itertools.chain.from_iterable(found))
+    place = {one: number for number, one in enumerate(members)}
+    own = {tuple(place[one] for one in group): parts for group, parts in found.items()}
+    kept = take_apart(solver, members)
+    trial, _ = _replace(take_apart(solver, members), own)
+    light, fallen = kept.model.render(kept.amplitude), np.zeros_like(kept.model.image)
+    for one, sign in ((kept, 1), (trial, -1)):
         one.run_briefly()
         step = None
         for _ in range(BODY_STEPS):
             step = take_step(one, step, instrument=False)
         assert step is not None
         fallen += sign * step.rest**2
-    model, bodies = solver.model, iter(list_bodies(trial))
-    gained = share_misfit(model, solver.amplitude, light, model.weights * fallen)
-    better = {}
-    wholes = zip(list_bodies(solver), model.parts, found.items(), strict=True)
-    for whole, part, (surface, begun) in wholes:
-        parts = [next(bodies) for _ in begun]
-        own = sum(body.coefficients.size for body in parts)
-        freedom = max(own - whole.coefficients.size, own / 4)
-        if float(gained[part].sum()) > BODY_GAIN * solver.variance * freedom:
-            better[surface] = parts
-    return better
+    model, before, after = kept.model, list_bodies(kept), iter(list_bodies(trial))
+    gained = share_misfit(model, kept.amplitude, light, model.weights * fallen)
+    trials = list[Trial]()
+    for (group, begun), places in zip(found.items(), own, strict=True):
+        bodies = [next(after) for _ in begun]
+        gain = sum(float(gained[model.parts[one]].sum()) for one in places)
+        free = sum(body.coefficients.size for body in bodies)
+        freed = sum(before[one].coefficients.size for one in places)
+        gain -= BODY_GAIN * solver.variance * max(free - freed, free / 4)
+        trials.append(Trial(gain, group, bodies))
+    return trials
 
 
 def list_bodies(solver: AmplitudeSolver) -> list[Body]:
@@ -143,18 +194,22 @@ def list_bodies(solver: AmplitudeSolver) -> list[Body]:
 
 
 def _replace(
-    solver: AmplitudeSolver, parts: Mapping[int, list[Body]]
-) -> tuple[AmplitudeSolver, list[int]]:
-    """Have bodies in place of some surfaces; also return the numbers of those of which one became several."""
-    model, owners = solver.model, list[int]()
-    bodies, several = list[Body](), list[int]()
-    for surface, whole in enumerate(list_bodies(solver)):
-        own = parts.get(surface, [whole])
-        if len(own) > 1:
-            several += range(len(bodies), len(bodies) + len(own))
+    solver: AmplitudeSolver, parts: Mapping[Group, list[Body]]
+) -> tuple[AmplitudeSolver, set[int]]:
+    """Have bodies in place of some groups of surfaces; also return their numbers."""
+    left = {(one,): [body] for one, body in enumerate(list_bodies(solver))}
+    for group in parts:
+        for one in group:
+            del left[one,]
+    bodies = [*itertools.chain.from_iterable(left.values())]
+    owners = [group[0] for group in left]
+    new = len(bodies)
+    for group, own in parts.items():
         bodies += own
-        owners += [surface] * len(own)
-    return lay_bodies(solver, bodies, model.state.shading[owners]), several
+        owners += [group[0]] * len(own)
+    return lay_bodies(solver, bodies, solver.model.state.shading[owners]), set(
+        range(new, len(bodies))
+    )
 
 
 def lay_bodies(

@@ -1,12 +1,8 @@
-"""Where a patch is several bodies that touch at one range, as a head and a torso, or two leaves: at valleys, at
-creases, and where most of it is one surface and the rest off it.
+"""Where a patch of frames' returns is several bodies that touch at one range, as a head and a torso, or two leaves:
+at valleys and at creases.
 """
 
 from __future__ import annotations
-
-import itertools
-from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -23,17 +19,13 @@ from tofclip.recovery.surfaces.patches import (
     Patch,
     bend_where_needed,
 )
-from tofclip.recovery.surfaces.shapes import TINY, Pixels, fit_quadric
+from tofclip.recovery.surfaces.shapes import TINY, Pixels
 
 # Misfit in its returns' deviations from which on a patch may be two at a crease (0.67 are expected of a surface's),
 # and what is left of it where it is: with as much freedom again a ball alone has 0.5.
 CREASE_SIGMAS, CREASE_FRACTION, CREASE_ROUNDS = 0.67, 0.5, 8
 # By which a valley between two bodies is farther than either, and of what neighbours scatter.
 VALLEY_BINS, VALLEY_SCALES = 2.0, 4.0
-# Where the shot decides which bodies are kept: what is left of the distances from one surface, for several to
-# be tried, and below which no others are.
-TRIED_FRACTION, PARTED_FRACTION = 0.85, 0.5
-OFF_SCALES = 2.0  # of the usual distance from a surface: what is further off together is another's
 
 
 def bend_patches(patches: list[Patch], bin_m: float) -> list[Patch]:
@@ -69,64 +61,14 @@ def _try_label(patch: Patch, label: Pixels, bin_m: float) -> tuple[list[Patch], 
     parts = [bend_where_needed(part, bin_m) for part in _take_parts(patch, label)]
     if len(parts) < 2:
         return [patch], np.inf
-    return parts, float(np.median(_list_distances(parts)))
-
-
-def find_bodies(patch: Patch, bin_m: float, most: float = TRIED_FRACTION) -> list[Patch]:
-    """Return the bodies, all of second order, of which a patch may consist, or the patch. `most`: what may be
-    left of its distances.
-    """
-    patch = _make_round(patch, bin_m)
-    error = _measure_distance([patch], bin_m)
-    if error < BEND_BINS * bin_m or patch.pixels.size < 2 * MIN_PATCH_PX:
-        return [patch]
-    best, least = [patch], most * error
-    for find in _find_valleys, _find_off, _find_creases:
-        for label in np.atleast_2d(find(patch, bin_m)):
-            plain = _take_parts(patch, label)
-            if len(plain) < 2:
-                continue
-            parts = [_make_round(part, bin_m) for part in plain]
-            if (left := _measure_distance(parts, bin_m)) < least:
-                best, least = parts, left
-        if least < PARTED_FRACTION * error:
-            break
-    return best
-
-
-def divide_further(bodies: list[Patch], bin_m: float) -> list[Patch]:
-    """Return the bodies of which these may consist in turn, as far as that is certain."""
-    divided = [find_bodies(body, bin_m, PARTED_FRACTION) for body in bodies]
-    if len(divided) == sum(map(len, divided)):
-        return bodies
-    return divide_further(list(itertools.chain.from_iterable(divided)), bin_m)
+    distances = [part.compute_distances() for part in parts]
+    return parts, float(np.median(np.concatenate(distances)))
 
 
 def _take_parts(patch: Patch, label: Pixels) -> list[Patch]:
     """The large enough parts of a patch by the number that each return has, (n,)."""
     numbers, sizes = np.unique(label, return_counts=True)
     return [patch.take(label == one) for one in numbers[sizes >= MIN_PATCH_PX]]
-
-
-def _make_round(patch: Patch, bin_m: float) -> Patch:
-    """A patch with a surface of second order if its returns need it and are nearer to that."""
-    if _measure_distance([patch], bin_m) < BEND_BINS * bin_m:
-        return patch
-    inverse = patch.ray_length.ravel()[patch.pixels] / patch.distance
-    basis, coefficients = fit_quadric(patch.pixels, inverse, patch.basis.image_shape)
-    curved = replace(patch, basis=basis, coefficients=coefficients)
-    return min(patch, curved, key=lambda one: _measure_distance([one], bin_m))
-
-
-def _measure_distance(patches: Sequence[Patch], bin_m: float) -> float:
-    """Mean distance of returns from the surfaces of their patches; none counts for more than a few bins."""
-    return float(np.mean(np.minimum(_list_distances(patches), SPLIT_BINS * bin_m)))
-
-
-def _list_distances(patches: Sequence[Patch]) -> FloatArray:
-    """Distances of returns from the surfaces of their patches, one after the other."""
-    off = [np.abs(one.compute_ranges(one.pixels) - one.distance) for one in patches]
-    return np.concatenate(off)
 
 
 def _find_valleys(patch: Patch, bin_m: float) -> Pixels:
@@ -162,24 +104,6 @@ def _find_valleys(patch: Patch, bin_m: float) -> Pixels:
             if distance - nearest[other] < least:
                 joined[other] = first
     return np.array([find(owner[here]) for here in places], np.intp)
-
-
-def _find_off(patch: Patch, bin_m: float) -> Pixels:
-    """Number what lies off the surface together, (n,); 0 is what does not."""
-    off = patch.compute_ranges(patch.pixels) - patch.distance
-    least = OFF_SCALES * 1.4826 * float(np.median(np.abs(off)))
-    mean = _average_beside(patch, off)
-    label, number = np.zeros(off.size, np.intp), 0
-    for side in (mean, -mean):
-        picture = np.zeros(patch.ray_length.shape, bool)
-        picture.ravel()[patch.pixels] = side > least
-        pieces, count = scipy.ndimage.label(picture)
-        large = np.bincount(pieces.ravel()) >= MIN_PATCH_PX
-        own = pieces.ravel()[patch.pixels]
-        own = np.where(large[own], own, 0)
-        label[own > 0] = number + own[own > 0]
-        number += count
-    return label
 
 
 def _find_creases(patch: Patch, bin_m: float) -> Pixels:

@@ -10,6 +10,7 @@ is seen, and its inverse depth over a `SmoothBasis`. Pixels are raster numbers, 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,6 +33,7 @@ NEIGHBOUR_BINS = 1.6  # neighbouring pixels whose ranges differ by less lie on o
 # Of that: by how much they may differ where the surface is turned as far on either side.
 STEEP_STEPS = 4.0
 STEEP_EXCESS = 1.5  # of that: two such differences have more noise than one
+LEAST_TOUCHING_PX = 5  # of a patch beside another
 MIN_PATCH_PX = 25  # fewer returns are not a surface of their own
 MIN_BEHIND_FRACTION = 0.25  # of a surface's usual brightness, for it to be seen behind another
 NEIGHBOURS_PX, MIN_CROWD = 5, 0.4  # side of a square, and how much of it must see the surface
@@ -98,6 +100,24 @@ class Patch:
         """Return the ranges of the surface at some pixels, (n,)."""
         inverse = self.basis.compute_inverse(self.basis.evaluate(pixels), self.coefficients)
         found: FloatArray = self.ray_length.ravel()[pixels] / inverse
+        return found
+
+    def compute_distances(self) -> FloatArray:
+        """Return the distances of the returns from their surface, (n,)."""
+        return np.asarray(np.abs(self.compute_ranges(self.pixels) - self.distance))
+
+    def find_touching(self, others: Sequence[Patch], apart: float) -> list[int]:
+        """Return the numbers of patches with returns beside some of this one, at ranges that differ by less, m."""
+        pictures = np.zeros((2, *self.ray_length.shape))
+        pictures.reshape(2, -1)[:, self.pixels] = np.ones(self.pixels.size), self.distance
+        beside = scipy.ndimage.uniform_filter(pictures, (0, 3, 3), mode="constant").reshape(2, -1)
+        found = []
+        for number, other in enumerate(others):
+            count, total = beside[:, other.pixels]
+            near = count > TINY
+            off = np.abs(total[near] / count[near] - other.distance[near])
+            if np.count_nonzero(off < apart) >= LEAST_TOUCHING_PX:
+                found.append(number)
         return found
 
     def compute_error(self, surface: Patch | None = None) -> float:

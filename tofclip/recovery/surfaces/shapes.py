@@ -39,6 +39,8 @@ LIMB = 0.44
 LIMB_LEVELS = np.array([1.0, 1.5, 2.0, 3.0, 5.0])
 # Of robust fits: each only has to be nearer than the one before, whose errors it weighs by.
 FIT_ROUNDS, FIT_STEPS, FIT_TOLERANCE = 3, 30, 1e-3
+# Of first guesses at them.
+STRAIGHT, LEAST_BEND, LEAST_SLOPE, GUESS_ROUNDS = 1e-4, 0.01, 0.05, 6
 FITTED_RETURNS = 500  # of nine unknowns, evenly chosen: with more a start is no better
 
 
@@ -247,14 +249,56 @@ class KnownBasis(SmoothBasis):
         return self.inverse.ravel()[pixels, np.newaxis]
 
 
+def guess_quadric(
+    pixels: Pixels, inverse: FloatArray, image_shape: tuple[int, int]
+) -> tuple[QuadricBasis, FloatArray]:
+    """Return the surface of second order, and its basis, that is nearest to inverse depths in first order (G. Taubin,
+    IEEE Trans. Pattern Anal. Mach. Intell. 13, 1115, 1991), where they differ least in sum.
+
+    With u, an inverse depth from their middle on in units, ``a u^2 + (1 + b x + c y) u + p(x, y)`` is 0 on such a
+    surface, and linear in what is looked for. Beside it u is off by this value over its slope.
+    """
+    basis, middle = _frame_quadric(pixels, inverse, image_shape)
+    some = slice(None, None, 1 + pixels.size // FITTED_RETURNS)
+    functions, u = basis.evaluate(pixels[some]), (inverse[some] - middle) / basis.unit
+    ways = functions[:, 1:LINEAR]
+    terms = np.column_stack([u * u, u[:, np.newaxis] * ways, functions])
+    straight = np.full(ROUND_COEFFICIENTS, TINY)
+    straight[:LINEAR] = STRAIGHT
+    sure = np.ones(u.size)
+    for _ in range(GUESS_ROUNDS):
+        weighed = sure[:, np.newaxis] * terms
+        normal = weighed.T @ weighed + u.size * np.diag(straight)
+        found = -np.linalg.solve(normal, weighed.T @ (sure * u))
+        slope = np.maximum(1 + 2 * found[0] * u + ways @ found[1:LINEAR], LEAST_SLOPE)
+        error = np.abs(u + terms @ found) / slope
+        sure = 1 / (slope * np.sqrt(np.maximum(error, np.median(error) / 2 + TINY)))
+        sure /= sure.max()
+    bend, across, down = found[:LINEAR]
+    bend = np.copysign(max(abs(bend), LEAST_BEND), bend)
+    linear = -basis.unit / (2 * bend) * np.array([1, across, down]) + [middle, 0, 0]
+    square = [1, 2 * across, 2 * down, across**2, 2 * across * down, down**2]
+    q = basis.unit / (8 * bend**2) * (square - 4 * bend * found[LINEAR:])
+    return replace(basis, sign=float(np.sign(bend))), np.concatenate([linear, q])
+
+
+def _frame_quadric(
+    pixels: Pixels, inverse: FloatArray, image_shape: tuple[int, int]
+) -> tuple[QuadricBasis, float]:
+    """A basis for some inverse depths, and their middle."""
+    corners = np.stack(np.divmod(pixels, image_shape[1]))
+    ends = corners.min(axis=1), corners.max(axis=1) + 1
+    unit = float(np.std(inverse)) + TINY
+    box = tuple(np.concatenate(ends).tolist())
+    return QuadricBasis(image_shape, box, unit=unit), float(np.median(inverse))
+
+
 def fit_quadric(
     pixels: Pixels, inverse: FloatArray, image_shape: tuple[int, int]
 ) -> tuple[QuadricBasis, FloatArray]:
     """Fit the inverse depths of returns robustly; return the basis and its coefficients."""
-    corners = np.stack(np.divmod(pixels, image_shape[1]))
-    ends = corners.min(axis=1), corners.max(axis=1) + 1
-    middle, unit = float(np.median(inverse)), float(np.std(inverse)) + TINY
-    basis = QuadricBasis(image_shape, tuple(np.concatenate(ends).tolist()), unit=unit)
+    basis, middle = _frame_quadric(pixels, inverse, image_shape)
+    unit = basis.unit
     some = slice(None, None, 1 + pixels.size // FITTED_RETURNS)
     functions, inverse = basis.evaluate(pixels[some]), inverse[some]
     plain, *_ = np.linalg.lstsq(functions, inverse)

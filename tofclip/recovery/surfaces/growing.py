@@ -1,0 +1,156 @@
+"""Of which bodies a patch may consist, all of second order: each grows from a few points on as far as returns are near
+it. Ranges are to follow the shot point by point; frames' returns are too far off at limbs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from tofclip.arrays import FloatArray
+from tofclip.recovery.surfaces.patches import (
+    BEND_BINS,
+    MIN_PATCH_PX,
+    NEIGHBOURS_PX,
+    SPLIT_BINS,
+    Patch,
+)
+from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, TINY, guess_quadric
+
+TRIED_FRACTION = 0.85  # what is left of the distances of returns, for other bodies to be tried
+# How many bodies are begun at most, or one in each square of `NEIGHBOURS_PX`; how near returns have to be, with those
+# beside them, that a body grows over; how far a body may reach over others; and how often.
+SEEDS, GROWN_BINS, BESIDE_PX, REACH_PX, ROUNDS = 50, 2.0, 3, 3, 8
+
+
+def find_bodies(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
+    """Return the bodies of which patches may consist together, of which one may be one surface of second order, or
+    none if these are not nearer to the returns: the largest that grows, then the largest of what it leaves, and so
+    on; at last each return goes to the body that is nearest.
+    """
+    whole = _join_returns(patches)
+    error = _measure_distance(patches if len(patches) > 1 else [_make_round(whole, bin_m)], bin_m)
+    if error < BEND_BINS * bin_m or whole.pixels.size < 2 * MIN_PATCH_PX:
+        return []
+    area = _Area(whole, bin_m)
+    parts = [_make_round(whole.take(own), bin_m) for own in area.settle(area.grow_bodies())]
+    if len(parts) > 1 and _measure_distance(parts, bin_m) < TRIED_FRACTION * error:
+        return parts
+    return []
+
+
+def _join_returns(patches: Sequence[Patch]) -> Patch:
+    """Return the patch that some are together, the nearest return of each pixel."""
+    distance = np.concatenate([one.distance for one in patches])
+    pixels = np.concatenate([one.pixels for one in patches])
+    order = np.argsort(distance, kind="stable")
+    pixels, first = np.unique(pixels[order], return_index=True)
+    return Patch.fit(
+        pixels, distance[order][first], np.full(pixels.size, TINY), patches[0].ray_length
+    )
+
+
+def _make_round(patch: Patch, bin_m: float) -> Patch:
+    """A patch with a surface of second order if its returns need it and are nearer to that."""
+    if _measure_distance([patch], bin_m) < BEND_BINS * bin_m:
+        return patch
+    inverse = patch.ray_length.ravel()[patch.pixels] / patch.distance
+    basis, coefficients = guess_quadric(patch.pixels, inverse, patch.basis.image_shape)
+    curved = replace(patch, basis=basis, coefficients=coefficients)
+    return min(patch, curved, key=lambda one: _measure_distance([one], bin_m))
+
+
+def _measure_distance(patches: Sequence[Patch], bin_m: float) -> float:
+    """Mean distance of returns from the surfaces of their patches; none counts for more than a few bins."""
+    distances = np.concatenate([patch.compute_distances() for patch in patches])
+    return float(np.mean(np.minimum(distances, SPLIT_BINS * bin_m)))
+
+
+class _Area:
+    """The returns of a patch as they lie beside each other. Bodies are said by which returns are theirs, (n,)."""
+
+    def __init__(self, patch: Patch, bin_m: float) -> None:
+        self.patch, self.bin_m = patch, bin_m
+        row, column = np.divmod(patch.pixels, patch.ray_length.shape[1])
+        self.y, self.x = row - row.min(), column - column.min()
+        self.side = max(NEIGHBOURS_PX, round(float(np.sqrt(row.size / SEEDS))))
+        self.beside = self._add_beside(np.ones(row.size))
+
+    def grow_bodies(self) -> list[NDArray[np.bool_]]:
+        """Bodies, the largest first, none of which has returns of another."""
+        free, bodies = np.ones(self.y.size, bool), list[NDArray[np.bool_]]()
+        seeds = np.flatnonzero((self.y % self.side == 0) & (self.x % self.side == 0))
+        grown = {seed: self._grow(seed, free) for seed in seeds.tolist()}
+        while True:
+            grown = {seed: (own, size) for seed, (own, size) in grown.items() if size > 0}
+            if not grown:
+                return bodies
+            best, _ = grown.pop(max(grown, key=lambda seed: grown[seed][1]))
+            bodies.append(best)
+            free &= ~best
+            for seed, (own, _) in grown.items():
+                if (own & best).any():
+                    grown[seed] = self._grow(seed, free)
+
+    def _grow(self, seed: int, free: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
+        """What grows from the returns about one, and its size: how many it has, the less the farther off they are."""
+        own = free & (np.hypot(self.y - self.y[seed], self.x - self.x[seed]) <= self.side)
+        size, most = 0.0, GROWN_BINS * self.bin_m
+        for _ in range(ROUNDS):
+            if not free[seed] or np.count_nonzero(own) <= ROUND_COEFFICIENTS:
+                return own, 0.0
+            off = self._measure_off(own)
+            pieces, _ = scipy.ndimage.label(self._paint(free & (off < most)), np.ones((3, 3)))
+            piece = pieces[self.y, self.x]
+            counts = np.bincount(piece[own], minlength=2)[1:]
+            if not counts.any():
+                return own, 0.0
+            near = self._reach(own, self.side - 1)
+            before, own = own, near & (piece == 1 + np.argmax(counts))
+            size = float(np.sum(1 - off[own] / most))
+            if (own == before).all():
+                break
+        return own, size if np.count_nonzero(own) >= MIN_PATCH_PX else 0.0
+
+    def settle(self, bodies: list[NDArray[np.bool_]]) -> list[NDArray[np.bool_]]:
+        """Give each return near bodies to the one that is nearest, until none changes."""
+        for _ in range(ROUNDS if bodies else 0):
+            off = np.array([self._measure_off(own) for own in bodies])
+            off[~np.array([self._reach(own, REACH_PX) for own in bodies])] = np.inf
+            nearest = np.where(np.isfinite(off).any(axis=0), off.argmin(axis=0), -1)
+            before, bodies = bodies, [nearest == number for number in range(len(bodies))]
+            if all((one == other).all() for one, other in zip(before, bodies, strict=True)):
+                break
+            bodies = [own for own in bodies if np.count_nonzero(own) >= MIN_PATCH_PX]
+        return bodies
+
+    def _measure_off(self, own: NDArray[np.bool_]) -> FloatArray:
+        """How far returns, and those beside them, are off the surface of some, (n,), m; none counts for more than a
+        few bins.
+        """
+        patch, most = self.patch, SPLIT_BINS * self.bin_m
+        ray_length = patch.ray_length.ravel()[patch.pixels]
+        inverse = ray_length[own] / patch.distance[own]
+        basis, found = guess_quadric(patch.pixels[own], inverse, patch.basis.image_shape)
+        inverse = basis.compute_inverse(basis.evaluate(patch.pixels), found)
+        off = np.abs(ray_length / np.maximum(inverse, TINY) - patch.distance)
+        return self._add_beside(np.minimum(off, most)) / self.beside
+
+    def _add_beside(self, values: FloatArray) -> FloatArray:
+        picture = scipy.ndimage.uniform_filter(self._paint(values), BESIDE_PX, mode="constant")
+        return np.asarray(picture[self.y, self.x])
+
+    def _reach(self, own: NDArray[np.bool_], far: int) -> NDArray[np.bool_]:
+        """Which returns are that near to some, along rows and columns, px."""
+        picture = scipy.ndimage.maximum_filter(self._paint(own), 2 * far + 1)
+        return np.asarray(picture[self.y, self.x])
+
+    def _paint(self, values: NDArray[Any]) -> NDArray[Any]:
+        picture = np.zeros((self.y.max() + 1, self.x.max() + 1), values.dtype)
+        picture[self.y, self.x] = values
+        return picture
