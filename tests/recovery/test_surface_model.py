@@ -11,13 +11,14 @@ import pytest
 from surface_scene import BIN, BIN_M, CAMERA, INSTRUMENT, SCENE, SHAPE, make_model
 
 from tofclip.camera import Camera
-from tofclip.lidar import Detection, depth
+from tofclip.lidar import Detection, compute_ray_directions, depth
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.creases import bend_patches
 from tofclip.recovery.surfaces.extents import find_usual_brightness
 from tofclip.recovery.surfaces.fit import SurfaceFit, extrapolate_step
+from tofclip.recovery.surfaces.growing import find_bodies
 from tofclip.recovery.surfaces.model import SurfaceModel, weigh_measurements
-from tofclip.recovery.surfaces.patches import find_plain_patches
+from tofclip.recovery.surfaces.patches import Patch, find_plain_patches
 from tofclip.recovery.surfaces.points import SurfaceState
 from tofclip.recovery.surfaces.pulse import ShotPulse, make_pulse, measure_pulse
 from tofclip.recovery.surfaces.ranges import (
@@ -36,7 +37,12 @@ from tofclip.recovery.surfaces.returns import (
     list_returns,
     round_rod,
 )
-from tofclip.recovery.surfaces.shapes import QuadricBasis, SmoothBasis, evaluate_monomials
+from tofclip.recovery.surfaces.shapes import (
+    QuadricBasis,
+    SmoothBasis,
+    evaluate_monomials,
+    guess_quadric,
+)
 from tofclip.recovery.surfaces.shifts import follow_local_shifts, measure_local_shifts
 from tofclip.recovery.surfaces.straighten import straighten_surfaces
 from tofclip.shots import Frames
@@ -100,6 +106,48 @@ def test_a_ball_and_the_cable_beside_it_are_parted():
     for patch in find_patches_in(truth + noise, things[0][2]):
         error = patch.compute_ranges(patch.pixels) - truth.ravel()[patch.pixels]
         assert np.median(np.abs(error)) < 0.15 * BIN_M
+
+
+def test_bodies_that_touch_grow_apart():
+    """Six that touch, whose ranges a surface of second order follows to a bin and more, and no valley parts."""
+    bodies = [
+        ((0.0, -0.118, 1.5), (1 / 0.03, 1 / 0.04, 1 / 0.035)),  # each with half its sides
+        ((0.0, 0.0, 1.5), (1 / 0.055, 1 / 0.085, 1 / 0.04)),
+        *(((side * 0.07, 0.0, 1.5), (1 / 0.02, 1 / 0.08, 1 / 0.02)) for side in (-1, 1)),
+        *(((side * 0.03, 0.11, 1.5), (1 / 0.025, 1 / 0.05, 1 / 0.025)) for side in (-1, 1)),
+    ]
+    seen = [meet(middle, 1, np.square(axes)) for middle, axes in bodies]
+    ranges = np.array([np.where(inside > 0, distance, np.inf) for distance, inside, _ in seen])
+    nearest, truth = ranges.argmin(axis=0).ravel(), ranges.min(axis=0)
+    pixels, bin_m = np.flatnonzero(np.isfinite(truth)), BIN_M / 4
+    noise = 0.3 * bin_m * np.random.default_rng(0).standard_normal(truth.shape)
+    distance = (truth + noise).ravel()[pixels]
+    patch = Patch.fit(pixels, distance, np.full(pixels.size, bin_m), seen[0][2])
+    assert patch.compute_error() > bin_m
+    parts = find_bodies([patch], bin_m)
+    owners = [np.bincount(nearest[part.pixels], minlength=6) for part in parts]
+    assert {int(owner.argmax()) for owner in owners} == set(range(6))
+    assert sum(owner.max() for owner in owners) > 0.95 * pixels.size
+    # what one surface follows as nearly is not taken apart
+    for part in parts:
+        assert find_bodies([part], bin_m) == []
+    assert find_bodies(parts, bin_m) == []
+
+
+@pytest.mark.parametrize("axes", [(1, 1, 1), (1, 0, 1)])
+def test_the_nearest_round_surface_does_not_follow_what_is_off(axes):
+    truth, inside, ray_length = meet((0.03, -0.02, 1.5), 0.12, axes)
+    pixels = np.flatnonzero(inside > 0.1 * inside.max())
+    distance = truth.ravel()[pixels]
+
+    def measure_error(distance):
+        basis, found = guess_quadric(pixels, ray_length.ravel()[pixels] / distance, truth.shape)
+        fitted = ray_length.ravel()[pixels] / basis.compute_inverse(basis.evaluate(pixels), found)
+        return np.median(np.abs(fitted - truth.ravel()[pixels]))
+
+    assert measure_error(distance) < 0.01 * BIN_M
+    distance[::10] += 5 * BIN_M  # 0.5 bins on average
+    assert measure_error(distance) < 0.25 * BIN_M
 
 
 @pytest.mark.parametrize("axes", [(1, 1, 1), (1, 0, 1)])
@@ -568,6 +616,35 @@ def test_pixels_at_the_side_of_a_rod_see_it_farther_away():
     )
     # what is as wide as pixels shows its own shape
     assert not round_rod(y, x, np.ones(y.size)).any()
+
+
+def test_a_pixel_of_a_ball_is_where_its_range_is_on_average(shot):
+    """The middle of one is nearer, everywhere alike: two parts a side leave a quarter of that."""
+
+    def look(right, down):
+        rays = compute_ray_directions(CAMERA, row + down, column + right)
+        along = rays @ middle
+        return along - np.sqrt(along**2 - middle @ middle + 0.1**2)
+
+    middle, mask = np.array([0, 0, 1.5]), np.zeros((1, *SHAPE), bool)
+    row, column = np.indices(SHAPE).reshape(2, -1)
+    with np.errstate(invalid="ignore"):
+        within = np.isfinite([look(x, y) for x in (-1, 1) for y in (-1, 1)]).all(axis=0)
+    mask.ravel()[:] = within
+    row, column = row[within], column[within]
+    near = look(0, 0)
+    places = (np.arange(8) - 3.5) / 8
+    average = np.mean([look(x, y) for x in places for y in places], axis=0)
+    length = 1 / compute_ray_directions(CAMERA, row, column)[:, 2]
+    basis, found = guess_quadric(np.flatnonzero(within), length / near, SHAPE)
+    state = SurfaceState.start([found], CAMERA)
+    model = SurfaceModel(shot.streak, CAMERA, mask, [basis], state)
+    rows = np.hypot(*model.compute_slopes()) / model.row_m
+    level = (rows > 0.7) & (rows < 1.5)
+    assert np.count_nonzero(level) > 50
+    left, before = (np.mean(one[level] - average[level]) for one in (model.distance, near))
+    assert before < 0
+    assert 0.6 * before < left < 0
 
 
 @pytest.mark.parametrize(
