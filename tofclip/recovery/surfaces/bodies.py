@@ -1,5 +1,5 @@
-"""Which surface is several, and which are one, as the whole shot decides: bodies that touch at one range, which the
-returns of frames do not tell from one. Where they may part is looked for in ranges that follow the shot point by point.
+"""Which bodies a surface is, or some surfaces that touch, as the whole shot decides: the returns of frames do not tell
+apart what touches at one range. Bodies are looked for in ranges that follow the shot point by point.
 """
 
 from __future__ import annotations
@@ -27,15 +27,17 @@ from tofclip.recovery.surfaces.start import measure_rays
 BODY_FRACTION = 0.3  # of a surface's usual brightness: ranges of what is dimmer say little
 FOLLOWED_BINS = 0.25  # ranges that follow the shot are that much nearer than those of frames
 BODY_MARGIN_PX = 3  # how far one body may reach into the next
-# Steps until bodies are compared with the surface that they were taken for, and how often, as they may be several
+# Steps until bodies are compared with the surfaces that they were taken for, and how often, as they may be several
 # again; by how much the misfit has to fall, in the noise's variance, for each number that bodies have more than the
-# surface, or a quarter of their own (4 to 30 where balls, leaves and tables were one, 45 to 2000 where there were
+# surfaces, or a quarter of their own (4 to 30 where balls, leaves and tables were one, 45 to 2000 where there were
 # several).
 BODY_STEPS, BODY_ROUNDS, BODY_GAIN = 2, 3, 40.0
-FINER = (0.75, 1.25)  # ever more bodies are looked for, and those kept that are worth most
+FINER = (
+    0.75,
+    1.25,
+)  # as if ranges were that much nearer to bodies: few of these are tried, and more
 # Surfaces are tried alone, and those together whose ranges differ by less where they touch, if they are few.
 TOUCHING_ROWS, MOST_MEMBERS = (0.0, 3.0), 6
-
 
 Group = tuple[int, ...]  # numbers of surfaces
 
