@@ -32,10 +32,8 @@ BODY_MARGIN_PX = 3  # how far one body may reach into the next
 # surfaces, or a quarter of their own (4 to 30 where balls, leaves and tables were one, 45 to 2000 where there were
 # several).
 BODY_STEPS, BODY_ROUNDS, BODY_GAIN = 2, 3, 40.0
-FINER = (
-    0.75,
-    1.25,
-)  # as if ranges were that much nearer to bodies: few of these are tried, and more
+# As if ranges were that much nearer to bodies: few of these are tried, and more.
+FINER = 0.75, 1.25
 # Surfaces are tried alone, and those together whose ranges differ by less where they touch, if they are few.
 TOUCHING_ROWS, MOST_MEMBERS = (0.0, 3.0), 6
 
@@ -162,7 +160,7 @@ def _try_bodies(solver: AmplitudeSolver, found: Mapping[Group, list[Body]]) -> l
     place = {one: number for number, one in enumerate(members)}
     own = {tuple(place[one] for one in group): parts for group, parts in found.items()}
     kept = take_apart(solver, members)
-    trial, _ = _replace(take_apart(solver, members), own)
+    trial, _ = _replace(kept, own)
     light, fallen = kept.model.render(kept.amplitude), np.zeros_like(kept.model.image)
     for one, sign in ((kept, 1), (trial, -1)):
         one.run_briefly()
@@ -203,15 +201,10 @@ def _replace(
     for group in parts:
         for one in group:
             del left[one,]
-    bodies = [*itertools.chain.from_iterable(left.values())]
-    owners = [group[0] for group in left]
-    new = len(bodies)
-    for group, own in parts.items():
-        bodies += own
-        owners += [group[0]] * len(own)
-    return lay_bodies(solver, bodies, solver.model.state.shading[owners]), set(
-        range(new, len(bodies))
-    )
+    bodies = [*itertools.chain.from_iterable([*left.values(), *parts.values()])]
+    owners = [group[0] for group, own in [*left.items(), *parts.items()] for _ in own]
+    replaced = lay_bodies(solver, bodies, solver.model.state.shading[owners])
+    return replaced, set(range(len(left), len(bodies)))
 
 
 def lay_bodies(

@@ -118,8 +118,8 @@ class Places(NamedTuple):
         row_m: float,
     ) -> Places:
         """Split points by the slopes of their surfaces, m per pixel; `aside`: where the middle of their
-        light is, px from the pixel's; both (2, points); `bent` (points,): those
-        of surfaces of second order in space.
+        light is, px from the pixel's; both (2, points); `bent` (points,): those of
+        surfaces of second order in space.
         """
         filled = 1 - 2 * np.abs(aside)
         slopes = slopes * filled
