@@ -346,7 +346,8 @@ def _approach_steep(solver: AmplitudeSolver, darkness: float) -> None:
         trial = AmplitudeSolver(longer, apart.amplitude, solver.weight, apart)
         trial.run_briefly()
         apart.amplitude = refine_state(longer, trial.amplitude, instrument=False).amplitude
-        apart.model.place(longer.state)
+        shapes = longer.state.coefficients
+        apart.model.place(replace(apart.model.state, coefficients=shapes))
     _put_back(solver, steep, apart)
     solver.run_briefly()
 

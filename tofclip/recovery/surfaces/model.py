@@ -15,13 +15,14 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera, estimate_dark_level
+from tofclip.camera.model import MergedSweep
 from tofclip.recovery.defects import estimate_noise
 from tofclip.recovery.surfaces.patches import MIN_BEHIND_FRACTION
 from tofclip.recovery.surfaces.points import SLIT_PIXELS, SurfacePoints, SurfaceState
@@ -41,6 +42,7 @@ Box = tuple[NDArray[np.int64], slice]  # rows, ascending, and columns
 MODEL_ERROR_FRACTION = 0.015  # of the brightest measurement: what the model leaves without noise
 DARK_VARIANCES = 2.0  # of the dark: dark measurements hold more of what the model lacks
 SMOOTHING_PX = 2.0
+LONGER_ROWS = 3.0  # of merged ones, a long pulse's deviation: no more are needed
 MIN_BEHIND_PX = 100  # of a surface, seen through another; fewer are a rim, of which each has a part
 FRONT_FRACTION = 0.5  # of a surface's usual brightness: it ends where its rim is darker
 
@@ -191,18 +193,38 @@ class SurfaceModel(SurfacePoints):
 
     def lengthen(self, sigma: float, amplitude: Image) -> Self:
         """Return the same surfaces before the shot as a longer pulse shows it, smoothed along rows: there those that
-        are several pulses off still meet their light. What is not valid is taken to be as amplitudes say.
+        are several pulses off still meet their light. Few rows hold it, in each of which several are added up. What
+        is not valid is taken to be as amplitudes say.
         """
+        number = max(int(sigma / LONGER_ROWS), 1)
+        whole = self.times.size // number * number
+
+        def merge(rows: NDArray[Any]) -> NDArray[Any]:
+            return rows[:whole].reshape(-1, number, *rows.shape[1:])
+
+        longer, camera, state = copy.copy(self), self.camera, self.state
+        if camera.sweep is not None:
+            longer.camera = camera.replace(sweep=MergedSweep(camera.sweep, number))
+        longer.times = merge(self.times).mean(axis=1)
+        longer.shape = longer.times.size, self.shape[1]
+        longer.bin_width, longer.row_m = number * self.bin_width, number * self.row_m
+        lags, own = np.unique(np.round(self.pulse.lags / number).astype(np.intp), return_inverse=True)
+        width = float(np.hypot(self.pulse.sigma, sigma)) / number
+        longer.pulse = ShotPulse(width, lags, np.bincount(own, self.pulse.shares))
         valid = self.weights > 0
         image = np.where(valid, self.image, self.render(amplitude))
         variance = valid / np.maximum(self.weights, TINY)
-        longer = self.respond(replace(self.pulse, sigma=float(np.hypot(self.pulse.sigma, sigma))))
         longer.image, around = (
-            smooth_rows_evenly(np.asarray(one, np.float32), sigma) for one in (image, variance)
+            scipy.ndimage.gaussian_filter1d(
+                merge(one).sum(axis=1, dtype=np.float32), sigma / number, axis=0, mode="constant"
+            )
+            for one in (image, variance)
         )
         # variance of one measurement over that of a weighted mean of independent ones
-        averaged = np.float32(2 * np.sqrt(np.pi) * sigma)
-        longer.weights = np.asarray(valid * averaged / np.maximum(around, TINY), np.float32)
+        averaged = np.float32(2 * np.sqrt(np.pi) * sigma / number)
+        longer.weights = merge(valid).mean(axis=1, dtype=np.float32) * averaged / np.maximum(around, TINY)
+        delays, stretches = state.delays / number, state.stretches / number
+        longer.place(replace(state, delays=delays, stretches=stretches))
         return longer
 
     def blur(self, sigma_px: float) -> Self:
