@@ -13,10 +13,9 @@ from surface_scene import BIN, BIN_M, CAMERA, INSTRUMENT, SCENE, SHAPE, make_mod
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, compute_ray_directions, depth
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
-from tofclip.recovery.surfaces.creases import bend_patches
 from tofclip.recovery.surfaces.extents import find_usual_brightness
 from tofclip.recovery.surfaces.fit import SurfaceFit, extrapolate_step
-from tofclip.recovery.surfaces.growing import find_bodies
+from tofclip.recovery.surfaces.growing import bend_patches, find_bodies
 from tofclip.recovery.surfaces.model import SurfaceModel, weigh_measurements
 from tofclip.recovery.surfaces.patches import Patch, find_plain_patches
 from tofclip.recovery.surfaces.points import SurfaceState

@@ -1,5 +1,5 @@
-"""Of which bodies a patch may consist, all of second order: each grows from a few points on as far as returns are near
-it. Ranges are to follow the shot point by point; frames' returns are too far off at limbs.
+"""Of which bodies a patch may consist, as a head and a torso, or two leaves that touch at one range. All are of second
+order, and each grows from a few points on as far as returns are near it.
 """
 
 from __future__ import annotations
@@ -19,19 +19,37 @@ from tofclip.recovery.surfaces.patches import (
     NEIGHBOURS_PX,
     SPLIT_BINS,
     Patch,
+    bend_where_needed,
 )
 from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, TINY, guess_quadric
 
-TRIED_FRACTION = 0.85  # what is left of the distances of returns, for other bodies to be tried
+NEARER = 0.75  # what is left of the distances of returns, for them to be of other bodies
 # How many bodies are begun at most, or one in each square of `NEIGHBOURS_PX`; how near returns have to be, with those
 # beside them, that a body grows over; how far a body may reach over others; and how often.
 SEEDS, GROWN_BINS, BESIDE_PX, REACH_PX, ROUNDS = 50, 2.0, 3, 3, 8
 
 
+def bend_patches(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
+    """Bend plain patches where their returns are, or as the bodies of which they consist where no one surface follows
+    these; the largest first.
+    """
+    bent = [one for patch in patches for one in _bend(patch, bin_m)]
+    return sorted(bent, key=lambda one: -one.pixels.size)
+
+
+def _bend(patch: Patch, bin_m: float) -> list[Patch]:
+    bent = bend_where_needed(patch, bin_m)
+    if bent.compute_error() < BEND_BINS * bin_m:
+        return [bent]
+    # what is algebraically nearest is off where frames' returns at a limb are too near
+    parts = [part.take(slice(None)) for part in find_bodies([patch], bin_m)]
+    return [bend_where_needed(part, bin_m) for part in parts] or [bent]
+
+
 def find_bodies(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
     """Return the bodies of which patches may consist together, of which one may be one surface of second order, or
     none if these are not nearer to the returns: the largest that grows, then the largest of what it leaves, and so
-    on; at last each return goes to the body that is nearest.
+    on; at last each return goes to the body that is nearest. What grew may be several bodies itself.
     """
     whole = _join_returns(patches)
     error = _measure_distance(patches if len(patches) > 1 else [_make_round(whole, bin_m)], bin_m)
@@ -39,20 +57,21 @@ def find_bodies(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
         return []
     area = _Area(whole, bin_m)
     parts = [_make_round(whole.take(own), bin_m) for own in area.settle(area.grow_bodies())]
-    if len(parts) > 1 and _measure_distance(parts, bin_m) < TRIED_FRACTION * error:
-        return parts
-    return []
+    if len(parts) < 2 or _measure_distance(parts, bin_m) >= NEARER * error:
+        return []
+    return [one for part in parts for one in find_bodies([part], bin_m) or [part]]
 
 
 def _join_returns(patches: Sequence[Patch]) -> Patch:
     """Return the patch that some are together, the nearest return of each pixel."""
-    distance = np.concatenate([one.distance for one in patches])
-    pixels = np.concatenate([one.pixels for one in patches])
-    order = np.argsort(distance, kind="stable")
-    pixels, first = np.unique(pixels[order], return_index=True)
-    return Patch.fit(
-        pixels, distance[order][first], np.full(pixels.size, TINY), patches[0].ray_length
+    pixels, distance, deviation = (
+        np.concatenate([getattr(one, name) for one in patches])
+        for name in ("pixels", "distance", "deviation")
     )
+    order = np.argsort(distance, kind="stable")
+    _, first = np.unique(pixels[order], return_index=True)
+    own = order[first]
+    return Patch.fit(pixels[own], distance[own], deviation[own], patches[0].ray_length)
 
 
 def _make_round(patch: Patch, bin_m: float) -> Patch:
@@ -105,8 +124,7 @@ class _Area:
             if not free[seed] or np.count_nonzero(own) <= ROUND_COEFFICIENTS:
                 return own, 0.0
             off = self._measure_off(own)
-            pieces, _ = scipy.ndimage.label(self._paint(free & (off < most)), np.ones((3, 3)))
-            piece = pieces[self.y, self.x]
+            piece = self._number_pieces(free & (off < most))
             counts = np.bincount(piece[own], minlength=2)[1:]
             if not counts.any():
                 return own, 0.0
@@ -123,11 +141,22 @@ class _Area:
             off = np.array([self._measure_off(own) for own in bodies])
             off[~np.array([self._reach(own, REACH_PX) for own in bodies])] = np.inf
             nearest = np.where(np.isfinite(off).any(axis=0), off.argmin(axis=0), -1)
-            before, bodies = bodies, [nearest == number for number in range(len(bodies))]
+            before = bodies
+            bodies = [self._connect(nearest == number) for number in range(len(bodies))]
             if all((one == other).all() for one, other in zip(before, bodies, strict=True)):
                 break
             bodies = [own for own in bodies if np.count_nonzero(own) >= MIN_PATCH_PX]
         return bodies
+
+    def _connect(self, own: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """The largest of the pieces of which some consist."""
+        piece = self._number_pieces(own)
+        return np.asarray(piece == 1 + np.argmax(np.bincount(piece, minlength=2)[1:]))
+
+    def _number_pieces(self, own: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """The connected piece of some that each return is in, from 1 on; 0 of others, (n,)."""
+        pieces, _ = scipy.ndimage.label(self._paint(own), np.ones((3, 3)))
+        return np.asarray(pieces[self.y, self.x])
 
     def _measure_off(self, own: NDArray[np.bool_]) -> FloatArray:
         """How far returns, and those beside them, are off the surface of some, (n,), m; none counts for more than a

@@ -208,9 +208,13 @@ class SurfaceModel(SurfacePoints):
         longer.times = merge(self.times).mean(axis=1)
         longer.shape = longer.times.size, self.shape[1]
         longer.bin_width, longer.row_m = number * self.bin_width, number * self.row_m
-        lags, own = np.unique(np.round(self.pulse.lags / number).astype(np.intp), return_inverse=True)
+        lags, own = np.unique(
+            np.round(self.pulse.lags / number).astype(np.intp), return_inverse=True
+        )
         width = float(np.hypot(self.pulse.sigma, sigma)) / number
-        longer.pulse = ShotPulse(width, lags, np.bincount(own, self.pulse.shares))
+        longer.pulse = ShotPulse(
+            width, lags, np.bincount(own, self.pulse.shares).astype(np.float64)
+        )
         valid = self.weights > 0
         image = np.where(valid, self.image, self.render(amplitude))
         variance = valid / np.maximum(self.weights, TINY)
@@ -222,7 +226,9 @@ class SurfaceModel(SurfacePoints):
         )
         # variance of one measurement over that of a weighted mean of independent ones
         averaged = np.float32(2 * np.sqrt(np.pi) * sigma / number)
-        longer.weights = merge(valid).mean(axis=1, dtype=np.float32) * averaged / np.maximum(around, TINY)
+        longer.weights = (
+            merge(valid).mean(axis=1, dtype=np.float32) * averaged / np.maximum(around, TINY)
+        )
         delays, stretches = state.delays / number, state.stretches / number
         longer.place(replace(state, delays=delays, stretches=stretches))
         return longer

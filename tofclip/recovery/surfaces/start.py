@@ -16,7 +16,7 @@ from tofclip.camera.noise import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar import compute_ray_directions, depth
 from tofclip.recovery.surfaces.amplitudes import LEAST_COUNT, AmplitudeSolver
-from tofclip.recovery.surfaces.creases import bend_patches
+from tofclip.recovery.surfaces.growing import bend_patches
 from tofclip.recovery.surfaces.model import (
     SMOOTHING_PX,
     SurfaceModel,
