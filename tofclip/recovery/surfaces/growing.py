@@ -23,7 +23,9 @@ from tofclip.recovery.surfaces.patches import (
 )
 from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, TINY, guess_quadric
 
-NEARER = 0.75  # what is left of the distances of returns, for them to be of other bodies
+# What is left of the distances of returns, for them to be of other bodies if the shot says so; and for frames' returns
+# to be without more ado: persons and leaves have 0.1 to 0.3, balls and melons, whose returns are displaced, 0.34 on.
+NEARER, SURELY_NEARER = 0.75, 0.3
 # How many bodies are begun at most, or one in each square of `NEIGHBOURS_PX`; how near returns have to be, with those
 # beside them, that a body grows over; how far a body may reach over others; and how often.
 SEEDS, GROWN_BINS, BESIDE_PX, REACH_PX, ROUNDS = 50, 2.0, 3, 3, 8
@@ -43,7 +45,9 @@ def _bend(patch: Patch, bin_m: float) -> list[Patch]:
         return [bent]
     # what is algebraically nearest is off where frames' returns at a limb are too near
     parts = [part.take(slice(None)) for part in find_bodies([patch], bin_m)]
-    return [bend_where_needed(part, bin_m) for part in parts] or [bent]
+    parts = [bend_where_needed(part, bin_m) for part in parts]
+    left = np.concatenate([part.compute_distances() for part in parts] or [[np.inf]])
+    return parts if np.median(left) < SURELY_NEARER * bent.compute_error() else [bent]
 
 
 def find_bodies(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
