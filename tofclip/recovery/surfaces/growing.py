@@ -108,36 +108,41 @@ class _Area:
         """Bodies, the largest first, none of which has returns of another."""
         free, bodies = np.ones(self.y.size, bool), list[NDArray[np.bool_]]()
         seeds = np.flatnonzero((self.y % self.side == 0) & (self.x % self.side == 0))
-        grown = {seed: self._grow(seed, free) for seed in seeds.tolist()}
+        grown = dict[int, tuple[NDArray[np.bool_], float]]()
         while True:
-            grown = {seed: (own, size) for seed, (own, size) in grown.items() if size > 0}
-            if not grown:
+            # what grows from deep within another body is mostly that one
+            left = free.copy()
+            for own, _ in grown.values():
+                left &= self._reach(~own, self.side - 1)
+            for seed in seeds[free[seeds]].tolist():
+                if left[seed] and seed not in grown:
+                    grown[seed] = self._grow(seed, free)
+                    left &= self._reach(~grown[seed][0], self.side - 1)
+            best, size = max(grown.values(), key=lambda one: one[1], default=(free, 0.0))
+            if not size:
                 return bodies
-            best, _ = grown.pop(max(grown, key=lambda seed: grown[seed][1]))
             bodies.append(best)
             free &= ~best
-            for seed, (own, _) in grown.items():
-                if (own & best).any():
-                    grown[seed] = self._grow(seed, free)
+            grown = {seed: one for seed, one in grown.items() if not (one[0] & best).any()}
 
     def _grow(self, seed: int, free: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
         """What grows from the returns about one, and its size: how many it has, the less the farther off they are."""
         own = free & (np.hypot(self.y - self.y[seed], self.x - self.x[seed]) <= self.side)
-        size, most = 0.0, GROWN_BINS * self.bin_m
+        size, most, nothing = 0.0, GROWN_BINS * self.bin_m, np.zeros_like(free)
         for _ in range(ROUNDS):
             if not free[seed] or np.count_nonzero(own) <= ROUND_COEFFICIENTS:
-                return own, 0.0
+                return nothing, 0.0
             off = self._measure_off(own)
             piece = self._number_pieces(free & (off < most))
             counts = np.bincount(piece[own], minlength=2)[1:]
             if not counts.any():
-                return own, 0.0
+                return nothing, 0.0
             near = self._reach(own, self.side - 1)
             before, own = own, near & (piece == 1 + np.argmax(counts))
             size = float(np.sum(1 - off[own] / most))
             if (own == before).all():
                 break
-        return own, size if np.count_nonzero(own) >= MIN_PATCH_PX else 0.0
+        return (own, size) if np.count_nonzero(own) >= MIN_PATCH_PX else (nothing, 0.0)
 
     def settle(self, bodies: list[NDArray[np.bool_]]) -> list[NDArray[np.bool_]]:
         """Give each return near bodies to the one that is nearest, until none changes."""
