@@ -46,8 +46,9 @@ def _bend(patch: Patch, bin_m: float) -> list[Patch]:
     # what is algebraically nearest is off where frames' returns at a limb are too near
     parts = [part.take(slice(None)) for part in find_bodies([patch], bin_m)]
     parts = [bend_where_needed(part, bin_m) for part in parts]
-    left = np.concatenate([part.compute_distances() for part in parts] or [[np.inf]])
-    return parts if np.median(left) < SURELY_NEARER * bent.compute_error() else [bent]
+    left = [distance for part in parts for distance in part.compute_distances()]
+    sure = len(parts) > 1 and np.median(left) < SURELY_NEARER * bent.compute_error()
+    return parts if sure else [bent]
 
 
 def find_bodies(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
