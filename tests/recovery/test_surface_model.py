@@ -233,6 +233,25 @@ def test_the_adjoint_matches(shot, blur_px: float):
     assert there == pytest.approx(float(np.vdot(x.astype(np.float64), model.gather(y))), rel=1e-4)
 
 
+@pytest.mark.parametrize("tail", [False, True])
+def test_few_rows_show_a_long_pulse_as_all_rows_smoothed_do(shot, tail: bool):
+    model = make_model(shot.streak)
+    if tail:
+        lags, shares = np.array([0, 3, 11]), np.array([0.7, 0.2, 0.1])
+        model = model.respond(ShotPulse(model.pulse.sigma, lags, shares))
+    uneven, random = model.state.copy(), np.random.default_rng(0)
+    uneven.delays[:], uneven.stretches[:] = random.uniform(-3, 3, (2, CAMERA.views))
+    model.place(uneven)
+    light = random.random(model.surface.size).astype(np.float32)
+    model.image = model.render(light)
+    longer = model.lengthen(12 * model.pulse.sigma, light)
+    assert 3 * len(longer.image) < len(model.image)
+    assert longer.image.max() > 0.1 * model.image.max()
+    np.testing.assert_allclose(
+        longer.render(light), longer.image, atol=0.02 * float(longer.image.max())
+    )
+
+
 def compare_squares(model, points):
     """Sum of squares of each point's own image, over what the model gathers of squares."""
     information = model.gather(np.ones_like(model.image), squared=True)
