@@ -24,8 +24,9 @@ from tofclip.recovery.surfaces.patches import (
 from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, TINY, guess_quadric
 
 # What is left of the distances of returns, for them to be of other bodies if the shot says so; and for frames' returns
-# to be without more ado: persons and leaves have 0.1 to 0.3, balls and melons, whose returns are displaced, 0.34 on.
-NEARER, SURELY_NEARER = 0.75, 0.3
+# to be without more ado: persons, leaves and letters have 0.1 to 0.33, balls and melons, whose returns are displaced,
+# 0.335 to 0.7.
+NEARER, SURELY_NEARER = 0.75, 1 / 3
 # How many bodies are begun at most, or one in each square of `NEIGHBOURS_PX`; how near returns have to be, with those
 # beside them, that a body grows over; how far a body may reach over others; and how often.
 SEEDS, GROWN_BINS, BESIDE_PX, REACH_PX, ROUNDS = 50, 2.0, 3, 3, 8
