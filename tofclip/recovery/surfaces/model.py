@@ -219,9 +219,7 @@ class SurfaceModel(SurfacePoints):
         image = np.where(valid, self.image, self.render(amplitude))
         variance = valid / np.maximum(self.weights, TINY)
         longer.image, around = (
-            scipy.ndimage.gaussian_filter1d(
-                merge(one).sum(axis=1, dtype=np.float32), sigma / number, axis=0, mode="constant"
-            )
+            smooth_rows_evenly(merge(one).sum(axis=1, dtype=np.float32), sigma / number)
             for one in (image, variance)
         )
         # variance of one measurement over that of a weighted mean of independent ones
