@@ -601,6 +601,16 @@ def test_where_the_shot_says_nothing_what_is_known_beforehand_decides(shot):
     )  # of both surfaces, half of each
 
 
+def test_of_a_surface_that_is_dark_no_range_is_known(shot):
+    """Its deviation was stated as 0 m."""
+    model = make_model(shot.streak)
+    dark = model.surface == 1
+    found = refine_state(model, np.where(dark, 0, 50).astype(np.float32), robust=True)
+    deviation = model.estimate_deviation(found.covariances)
+    assert np.all(deviation[dark] > 1e3)
+    assert np.all(deviation[~dark] < 10 * BIN_M)
+
+
 def test_the_objective_holds_what_is_known_of_surfaces_beforehand(shot):
     """Bent surfaces that a shot without noise shows to be so: nothing but the bending is left."""
     model = make_model(shot.streak)

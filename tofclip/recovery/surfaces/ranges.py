@@ -376,7 +376,8 @@ def refine_state(
     newton = inverse @ (equations.slope - first)
     covariance = inverse
     if robust:
-        covariance = equations.estimate_covariances(inverse, second)
+        # of a surface that is dark nothing is known, and not all
+        covariance = equations.estimate_covariances(inverse, second + RIDGE * np.diag(unit**2))
         # What a sweep's prior still takes of all ranges, as if most of it were not there
         weaker = (equations.normal + SWEEP_DOUBT * second) / np.outer(unit, unit)
         swept = np.array([name in SWEEP_SIGMAS for name, _, _ in names])
