@@ -26,7 +26,6 @@ from tofclip.camera.model import interpolate_linearly
 from tofclip.lidar import compute_ray_directions
 from tofclip.recovery.surfaces.pulse import (
     EXTENT_SIGMAS,
-    FWHM_PER_SIGMA,
     TINY,
     Image,
     ShotPulse,
@@ -40,7 +39,7 @@ from tofclip.recovery.surfaces.shapes import (
 )
 from tofclip.shots import Streak
 from tofclip.threads import map_parallel, split_blocks, thread_count
-from tofclip.units import SPEED_OF_LIGHT
+from tofclip.units import FWHM_PER_SIGMA, SPEED_OF_LIGHT
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

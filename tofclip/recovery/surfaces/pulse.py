@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
 from tofclip.lidar.pulse import Pulse
+from tofclip.units import FWHM_PER_SIGMA
 
 Image = NDArray[np.float32]
 
-FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
 REACH_BEFORE, REACH_AFTER = 2.0, 14.0  # camera's pulse widths: what is looked at
 SHOWN = 15_000  # lit measurements, of evenly chosen columns, say as much of a few dozen lags as all
 COURSE_RIDGE = 1e-4  # of a lag's own information

@@ -453,12 +453,17 @@ def doubt_borders(model: SurfaceModel, amplitude: Image) -> Image:
     add to their variance: their light comes from any part of the pixel, and where the surface is steep
     that is a range of its own, by which the whole of it would be turned or moved.
     """
-    light = model.find_light_beside(amplitude)
-    uneven = [np.abs(a - b) / np.maximum(a + b, TINY) for a, b in light]
-    late = LEFT_ASIDE_PX * np.hypot(*(np.array(uneven) * model.compute_slopes())) / model.row_m
+    late = estimate_border_shift(model, amplitude) / model.row_m
     late *= np.array([not isinstance(basis, QuadricBasis) for basis in model.bases])[model.surface]
     moved = delay_light(model).render((amplitude * late).astype(np.float32))
     return model.weights / (1 + model.weights * moved**2)
+
+
+def estimate_border_shift(model: SurfaceModel, amplitude: Image) -> FloatArray:
+    """How far off points are, (points,), m, of whose pixels a surface may fill any part."""
+    light = model.find_light_beside(amplitude)
+    uneven = [np.abs(a - b) / np.maximum(a + b, TINY) for a, b in light]
+    return LEFT_ASIDE_PX * np.hypot(*(np.array(uneven) * model.compute_slopes()))
 
 
 def delay_light(model: SurfaceModel) -> SurfaceModel:

@@ -20,11 +20,12 @@ from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.others import NEAR_BINS, find_near
 from tofclip.recovery.surfaces.patches import rank_within_pixels
 from tofclip.recovery.surfaces.pulse import Image
+from tofclip.recovery.surfaces.ranges import estimate_border_shift
 from tofclip.recovery.surfaces.shapes import TINY, Pixels
 from tofclip.recovery.surfaces.shifts import SHIFT_SHOWN, follow_local_shifts, measure_local_shifts
 from tofclip.shots import Returns
 from tofclip.threads import limit_blas_threads
-from tofclip.units import SPEED_OF_LIGHT
+from tofclip.units import FWHM_PER_SIGMA, SPEED_OF_LIGHT
 
 # Logarithm of the odds that a surface's point is false: nothing known, for each e-fold of the deviations
 # by which it is out of the noise, where the frames have returns beside all points about it, for each
@@ -44,6 +45,8 @@ ROD_FRACTION, ROD_RADIUS_PX, ROD_SPREAD_PX, ROD_PX = 0.1, 0.6, 1.3, 0.06
 # Of a pixel, root mean square, light lies higher or lower than where it is put: views tell rows only by how
 # their lines lean. Tables that are turned are off by 0.02 to 0.05 of what a pixel spans.
 ROW_ERROR_PX = 0.02
+# Of how far apart surfaces are that share a pixel's light, by how much the mean of that is off: of bodies that touch.
+SHARED_DOUBT = 0.5
 # Middle of a part of a pixel from the pixel's own, root mean square over parts of all sizes.
 PART_PX = 1 / np.sqrt(12)
 
@@ -91,7 +94,8 @@ def list_returns(
             rounded[rod] = ROD_PX * pixel_m
     distance = distance + depth
     hidden = estimate_hidden_shift(model, amplitude)
-    parts = np.stack([fitted, fit.remainder, *moved, bent, rounded, hidden])
+    bordering = estimate_border_shift(model, amplitude)
+    parts = np.stack([fitted, fit.remainder, *moved, bent, rounded, hidden, bordering])
     deviation = np.sqrt(np.sum(parts**2, axis=0) + model.estimate_sweep_error() ** 2)
     found = Returns(
         y=y.astype(np.int32),
@@ -103,8 +107,42 @@ def list_returns(
         time=2 * distance[chosen] / SPEED_OF_LIGHT,
         camera=camera,
         false_alarm=doubt[strong],
-    ).merge(others)
+    )
+    pulse_m = FWHM_PER_SIGMA * model.pulse.sigma * model.row_m
+    found = join_unresolved(found, pulse_m).merge(others)
     return correct_returns(replace(found, shear=np.asarray(camera.shear_at(found.range))))
+
+
+def join_unresolved(found: Returns, pulse_m: float) -> Returns:
+    """Make one return of those of a pixel whose ranges differ by less than a pulse is long, one from the next: a shot
+    does not tell them apart, but it does tell where their light is on average. Surfaces that overlap, as those of a
+    head and a torso do at a neck, share the light of a pixel as they like. A part of how far apart they are is not
+    known of that either.
+    """
+    columns = found.camera.image_shape[1]
+    pixel = found.y.astype(np.intp) * columns + found.x
+    order, rank = rank_within_pixels(pixel, found.range)
+    own = found[order]
+    group = np.cumsum((rank == 0) | (np.diff(own.range, prepend=0.0) >= pulse_m)) - 1
+    first = np.unique(group, return_index=True)[1]
+    light = own.intensity / own.range**2
+    whole = np.bincount(group, light)
+
+    def average(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(group, light * values) / whole)
+
+    distance = average(own.range)
+    apart = SHARED_DOUBT * (own.range - distance[group])
+    variance = average(own.confidence.astype(np.float64) ** 2 + apart**2)
+    return replace(
+        own[first],
+        range=distance,
+        time=2 * distance / SPEED_OF_LIGHT,
+        intensity=(whole * distance**2).astype(np.float32),
+        confidence=np.sqrt(variance).astype(np.float32),
+        # one of them is enough
+        false_alarm=np.minimum.reduceat(own.false_alarm, first),
+    )
 
 
 def round_rod(y: Pixels, x: Pixels, light: FloatArray) -> FloatArray:
