@@ -461,7 +461,7 @@ def doubt_borders(model: SurfaceModel, amplitude: Image) -> Image:
 
 def estimate_border_shift(model: SurfaceModel, amplitude: Image) -> FloatArray:
     """How far off points are, (points,), m, of whose pixels a surface may fill any part."""
-    light = model.find_light_beside(amplitude)
+    light = model.find_light_beside((amplitude / model.facing).astype(np.float32))
     uneven = [np.abs(a - b) / np.maximum(a + b, TINY) for a, b in light]
     return LEFT_ASIDE_PX * np.hypot(*(np.array(uneven) * model.compute_slopes()))
 

@@ -32,7 +32,7 @@ from tofclip.units import FWHM_PER_SIGMA, SPEED_OF_LIGHT
 # e-fold of the part of its surface's light that may as well lie elsewhere, of the number of the surface's
 # points, and of its place's brightness beside the brightest, times the part of the light that may as well
 # lie elsewhere. Logistic regression on points of 28 simulated shots; docs tell what they miss.
-FALSE_ODDS = np.array([9.76, -0.99, -3.07, 2.35, -0.40, -1.64])
+FALSE_ODDS = np.array([11.10, -1.18, -4.48, 2.51, -0.45, -4.10])
 # Less, and of light elsewhere more, makes no difference.
 LEAST_ELSEWHERE, MOST_ELSEWHERE, LEAST_PART, LEAST_BRIGHT = 0.07, 0.5, 0.02, 0.01
 ABOUT_PX = 5  # side of the square
