@@ -41,7 +41,7 @@ LIMB_LEVELS = np.array([1.0, 1.5, 2.0, 3.0, 5.0])
 FIT_ROUNDS, FIT_STEPS, FIT_TOLERANCE = 3, 30, 1e-3
 # Of the nearest in first order: what keeps it straight where nothing bends it, per value; how far it is bent at
 # least, as a root cannot be straight; and the least slope, in its units.
-STRAIGHT, LEAST_BEND, LEAST_SLOPE, GUESS_ROUNDS = 1e-4, 0.01, 0.05, 6
+STRAIGHT, LEAST_BEND, LEAST_SLOPE, GUESS_ROUNDS = 1e-4, 0.01, 0.05, 3
 FITTED_RETURNS = 500  # of nine unknowns, evenly chosen: with more a start is no better
 
 
