@@ -31,8 +31,8 @@ from tofclip.units import FWHM_PER_SIGMA, SPEED_OF_LIGHT
 # by which it is out of the noise, where the frames have returns beside all points about it, for each
 # e-fold of the part of its surface's light that may as well lie elsewhere, of the number of the surface's
 # points, and of its place's brightness beside the brightest, times the part of the light that may as well
-# lie elsewhere. Logistic regression on points of 57 simulated shots; docs tell what they miss.
-FALSE_ODDS = np.array([11.10, -1.18, -4.48, 2.51, -0.45, -4.10])
+# lie elsewhere. Logistic regression on points of 58 simulated shots; docs tell what they miss.
+FALSE_ODDS = np.array([11.21, -1.03, -4.85, 2.53, -0.49, -3.92])
 # Less, and of light elsewhere more, makes no difference.
 LEAST_ELSEWHERE, MOST_ELSEWHERE, LEAST_PART, LEAST_BRIGHT = 0.07, 0.5, 0.02, 0.01
 ABOUT_PX = 5  # side of the square
