@@ -172,3 +172,5 @@ def test_splines_are_a_quadratic_and_what_bends():
     pixels = np.ravel_multi_index(np.mgrid[2:28, 8:40].reshape(2, -1), shape)
     monomials = evaluate_monomials(pixels, shape)
     np.testing.assert_allclose(basis.evaluate(pixels) @ coefficients, monomials, atol=1e-8)
+    # no pixel at all ended the recovery of a shot
+    assert basis.evaluate(pixels[:0]).shape == (0, len(coefficients))

@@ -11,6 +11,7 @@ range is steeper there than any polynomial or spline.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -69,6 +70,8 @@ class SmoothBasis:
         """
         if self.is_quadratic:
             return evaluate_monomials(pixels, self.image_shape)
+        if pixels.size == 0:  # which scipy refuses
+            return np.zeros((0, math.prod(pieces + SPLINE_DEGREE for pieces in self.pieces)))
         from scipy.interpolate import BSpline
 
         along = []
