@@ -123,8 +123,8 @@ def join_unresolved(found: Returns, pulse_m: float) -> Returns:
     pixel = found.y.astype(np.intp) * columns + found.x
     order, rank = rank_within_pixels(pixel, found.range)
     own = found[order]
-    group = np.cumsum((rank == 0) | (np.diff(own.range, prepend=0.0) >= pulse_m)) - 1
-    first = np.unique(group, return_index=True)[1]
+    begins = (rank == 0) | (np.diff(own.range, prepend=0.0) >= pulse_m)
+    first, group = np.flatnonzero(begins), np.cumsum(begins) - 1
     light = own.intensity / own.range**2
     whole = np.bincount(group, light)
 
@@ -140,7 +140,7 @@ def join_unresolved(found: Returns, pulse_m: float) -> Returns:
         time=2 * distance / SPEED_OF_LIGHT,
         intensity=(whole * distance**2).astype(np.float32),
         confidence=np.sqrt(variance).astype(np.float32),
-        # one of them is enough
+        # that one is true is enough
         false_alarm=np.minimum.reduceat(own.false_alarm, first),
     )
 
