@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 import scipy
@@ -30,6 +30,9 @@ NEARER, SURELY_NEARER = 0.75, 1 / 3
 # How many bodies are begun at most, or one in each square of `NEIGHBOURS_PX`; how near returns have to be, with those
 # beside them, that a body grows over; how far a body may reach over others; and how often.
 SEEDS, GROWN_BINS, BESIDE_PX, REACH_PX, ROUNDS = 50, 2.0, 3, 3, 8
+
+
+Box = tuple[slice, slice]  # rows and columns
 
 
 def bend_patches(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
@@ -61,8 +64,8 @@ def find_bodies(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
     error = _measure_distance(patches if len(patches) > 1 else [_make_round(whole, bin_m)], bin_m)
     if error < BEND_BINS * bin_m or whole.pixels.size < 2 * MIN_PATCH_PX:
         return []
-    area = _Area(whole, bin_m)
-    parts = [_make_round(whole.take(own), bin_m) for own in area.settle(area.grow_bodies())]
+    bodies = _Area(whole, bin_m).find_bodies()
+    parts = [_make_round(whole.take(own), bin_m) for own in bodies]
     if len(parts) < 2 or _measure_distance(parts, bin_m) >= NEARER * error:
         return []
     return [one for part in parts for one in find_bodies([part], bin_m) or [part]]
@@ -97,29 +100,38 @@ def _measure_distance(patches: Sequence[Patch], bin_m: float) -> float:
 
 
 class _Area:
-    """The returns of a patch as they lie beside each other. Bodies are said by which returns are theirs, (n,)."""
+    """The returns of a patch as they lie beside each other. Bodies are pictures of which returns are theirs."""
 
     def __init__(self, patch: Patch, bin_m: float) -> None:
         self.patch, self.bin_m = patch, bin_m
         row, column = np.divmod(patch.pixels, patch.ray_length.shape[1])
-        self.y, self.x = row - row.min(), column - column.min()
+        self.place = row - row.min(), column - column.min()
+        self.free = np.zeros([int(one.max()) + 1 for one in self.place], bool)
+        self.free[self.place] = True
+        self.distance, self.ray_length = np.ones((2, *self.free.shape))
+        self.distance[self.place] = patch.distance
+        self.ray_length[self.place] = patch.ray_length[row, column]
+        self.corner = int(row.min()), int(column.min())
         self.side = max(NEIGHBOURS_PX, round(float(np.sqrt(row.size / SEEDS))))
-        self.beside = self._add_beside(np.ones(row.size))
 
-    def grow_bodies(self) -> list[NDArray[np.bool_]]:
+    def find_bodies(self) -> list[NDArray[np.bool_]]:
+        """Say which returns are of which body, (n,) each."""
+        return [own[self.place] for own in self._settle(self._grow_bodies())]
+
+    def _grow_bodies(self) -> list[NDArray[np.bool_]]:
         """Bodies, the largest first, none of which has returns of another."""
-        free, bodies = np.ones(self.y.size, bool), list[NDArray[np.bool_]]()
-        seeds = np.flatnonzero((self.y % self.side == 0) & (self.x % self.side == 0))
-        grown = dict[int, tuple[NDArray[np.bool_], float]]()
+        free, bodies = self.free.copy(), list[NDArray[np.bool_]]()
+        seeds = np.argwhere(free[:: self.side, :: self.side]) * self.side
+        grown = dict[tuple[int, ...], tuple[NDArray[np.bool_], float]]()
         while True:
             # what grows from deep within another body is mostly that one
             left = free.copy()
             for own, _ in grown.values():
-                left &= self._reach(~own, self.side - 1)
-            for seed in seeds[free[seeds]].tolist():
+                left &= _reach(self.free & ~own, self.side - 1)
+            for seed in map(tuple, seeds):
                 if left[seed] and seed not in grown:
                     grown[seed] = self._grow(seed, free)
-                    left &= self._reach(~grown[seed][0], self.side - 1)
+                    left &= _reach(self.free & ~grown[seed][0], self.side - 1)
             best, size = max(grown.values(), key=lambda one: one[1], default=(free, 0.0))
             if not size:
                 return bodies
@@ -127,70 +139,82 @@ class _Area:
             free &= ~best
             grown = {seed: one for seed, one in grown.items() if not (one[0] & best).any()}
 
-    def _grow(self, seed: int, free: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
+    def _grow(
+        self, seed: tuple[int, ...], free: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_], float]:
         """What grows from the returns about one, and its size: how many it has, the less the farther off they are."""
-        own = free & (np.hypot(self.y - self.y[seed], self.x - self.x[seed]) <= self.side)
+        down, right = np.ogrid[: free.shape[0], : free.shape[1]]
+        own = free & (np.hypot(down - seed[0], right - seed[1]) <= self.side)
         size, most, nothing = 0.0, GROWN_BINS * self.bin_m, np.zeros_like(free)
         for _ in range(ROUNDS):
             if not free[seed] or np.count_nonzero(own) <= ROUND_COEFFICIENTS:
                 return nothing, 0.0
-            off = self._measure_off(own)
-            piece = self._number_pieces(free & (off < most))
-            counts = np.bincount(piece[own], minlength=2)[1:]
+            about = _find_box(own, self.side)
+            off, before = self._measure_off(own, about), own[about]
+            piece, _ = scipy.ndimage.label(free[about] & (off < most), np.ones((3, 3)))
+            counts = np.bincount(piece[before], minlength=2)[1:]
             if not counts.any():
                 return nothing, 0.0
-            near = self._reach(own, self.side - 1)
-            before, own = own, near & (piece == 1 + np.argmax(counts))
-            size = float(np.sum(1 - off[own] / most))
-            if (own == before).all():
+            after = _reach(before, self.side - 1) & (piece == 1 + np.argmax(counts))
+            size = float(np.sum(1 - off[after] / most))
+            own = np.zeros_like(free)
+            own[about] = after
+            if (after == before).all():
                 break
         return (own, size) if np.count_nonzero(own) >= MIN_PATCH_PX else (nothing, 0.0)
 
-    def settle(self, bodies: list[NDArray[np.bool_]]) -> list[NDArray[np.bool_]]:
+    def _settle(self, bodies: list[NDArray[np.bool_]]) -> list[NDArray[np.bool_]]:
         """Give each return near bodies to the one that is nearest, until none changes."""
         for _ in range(ROUNDS if bodies else 0):
-            off = np.array([self._measure_off(own) for own in bodies])
-            off[~np.array([self._reach(own, REACH_PX) for own in bodies])] = np.inf
+            off = np.full((len(bodies), *self.free.shape), np.inf)
+            for own, far in zip(bodies, off, strict=True):
+                about = _find_box(own, REACH_PX + BESIDE_PX)
+                near = _reach(own[about], REACH_PX) & self.free[about]
+                far[about] = np.where(near, self._measure_off(own, about), np.inf)
             nearest = np.where(np.isfinite(off).any(axis=0), off.argmin(axis=0), -1)
             before = bodies
-            bodies = [self._connect(nearest == number) for number in range(len(bodies))]
+            bodies = [_find_largest(nearest == number) for number in range(len(bodies))]
             if all((one == other).all() for one, other in zip(before, bodies, strict=True)):
                 break
             bodies = [own for own in bodies if np.count_nonzero(own) >= MIN_PATCH_PX]
         return bodies
 
-    def _connect(self, own: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """The largest of the pieces of which some consist."""
-        piece = self._number_pieces(own)
-        return np.asarray(piece == 1 + np.argmax(np.bincount(piece, minlength=2)[1:]))
-
-    def _number_pieces(self, own: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """The connected piece of some that each return is in, from 1 on; 0 of others, (n,)."""
-        pieces, _ = scipy.ndimage.label(self._paint(own), np.ones((3, 3)))
-        return np.asarray(pieces[self.y, self.x])
-
-    def _measure_off(self, own: NDArray[np.bool_]) -> FloatArray:
-        """How far returns, and those beside them, are off the surface of some, (n,), m; none counts for more than a
-        few bins.
+    def _measure_off(self, own: NDArray[np.bool_], about: Box) -> FloatArray:
+        """How far the returns of a box, and those beside them, are off the surface of some, m; none counts for more
+        than a few bins.
         """
-        patch, most = self.patch, SPLIT_BINS * self.bin_m
-        ray_length = patch.ray_length.ravel()[patch.pixels]
-        inverse = ray_length[own] / patch.distance[own]
-        basis, found = guess_quadric(patch.pixels[own], inverse, patch.basis.image_shape)
-        inverse = basis.compute_inverse(basis.evaluate(patch.pixels), found)
-        off = np.abs(ray_length / np.maximum(inverse, TINY) - patch.distance)
-        return self._add_beside(np.minimum(off, most)) / self.beside
+        columns = self.patch.ray_length.shape[1]
+        row, column = (first + one for first, one in zip(self.corner, np.nonzero(own), strict=True))
+        inverse = self.ray_length[own] / self.distance[own]
+        shape = self.patch.basis.image_shape
+        basis, found = guess_quadric(row * columns + column, inverse, shape)
+        seen, off = self.free[about], np.zeros(self.free[about].shape)
+        row, column = np.nonzero(seen)
+        row, column = (
+            row + about[0].start + self.corner[0],
+            column + about[1].start + self.corner[1],
+        )
+        inverse = basis.compute_inverse(basis.evaluate(row * columns + column), found)
+        away = self.ray_length[about][seen] / np.maximum(inverse, TINY)
+        away = np.abs(away - self.distance[about][seen])
+        off[seen] = np.minimum(away, SPLIT_BINS * self.bin_m)
+        mean = partial(scipy.ndimage.uniform_filter, size=BESIDE_PX, mode="constant")
+        return np.asarray(mean(off) / np.maximum(mean(seen.astype(np.float64)), TINY))
 
-    def _add_beside(self, values: FloatArray) -> FloatArray:
-        picture = scipy.ndimage.uniform_filter(self._paint(values), BESIDE_PX, mode="constant")
-        return np.asarray(picture[self.y, self.x])
 
-    def _reach(self, own: NDArray[np.bool_], far: int) -> NDArray[np.bool_]:
-        """Which returns are that near to some, along rows and columns, px."""
-        picture = scipy.ndimage.maximum_filter(self._paint(own), 2 * far + 1)
-        return np.asarray(picture[self.y, self.x])
+def _find_largest(own: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The largest of the connected pieces of which some consist."""
+    piece, _ = scipy.ndimage.label(own, np.ones((3, 3)))
+    return np.asarray(piece == 1 + np.argmax(np.bincount(piece.ravel(), minlength=2)[1:]))
 
-    def _paint(self, values: NDArray[Any]) -> NDArray[Any]:
-        picture = np.zeros((self.y.max() + 1, self.x.max() + 1), values.dtype)
-        picture[self.y, self.x] = values
-        return picture
+
+def _find_box(own: NDArray[np.bool_], far: int) -> Box:
+    """The rows and columns about some, and as many more px."""
+    (box,) = scipy.ndimage.find_objects(own.astype(np.int8))
+    down, right = (slice(max(one.start - far, 0), one.stop + far) for one in box)
+    return down, right
+
+
+def _reach(own: NDArray[np.bool_], far: int) -> NDArray[np.bool_]:
+    """What is that near to some, along rows and columns, px."""
+    return np.asarray(scipy.ndimage.maximum_filter(own, 2 * far + 1))

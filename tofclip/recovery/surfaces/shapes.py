@@ -266,17 +266,18 @@ def guess_quadric(
     some = slice(None, None, 1 + pixels.size // FITTED_RETURNS)
     functions, u = basis.evaluate(pixels[some]), (inverse[some] - middle) / basis.unit
     ways = functions[:, 1:LINEAR]
-    terms = np.column_stack([u * u, u[:, np.newaxis] * ways, functions])
-    straight = np.full(ROUND_COEFFICIENTS, TINY)
-    straight[:LINEAR] = STRAIGHT
-    sure = np.ones(u.size)
+    terms = np.column_stack([u * u, u[:, np.newaxis] * ways, functions, u])
+    straight = np.full(ROUND_COEFFICIENTS, u.size * TINY)
+    straight[:LINEAR] = u.size * STRAIGHT
+    sure, middle_error = np.ones(u.size), u.size // 2
     for _ in range(GUESS_ROUNDS):
         weighed = sure[:, np.newaxis] * terms
-        normal = weighed.T @ weighed + u.size * np.diag(straight)
-        found = -np.linalg.solve(normal, weighed.T @ (sure * u))
+        normal = weighed.T @ weighed
+        found = -np.linalg.solve(normal[:-1, :-1] + np.diag(straight), normal[:-1, -1])
         slope = np.maximum(1 + 2 * found[0] * u + ways @ found[1:LINEAR], LEAST_SLOPE)
-        error = np.abs(u + terms @ found) / slope
-        sure = 1 / (slope * np.sqrt(np.maximum(error, np.median(error) / 2 + TINY)))
+        error = np.abs(terms @ np.append(found, 1.0)) / slope
+        usual = np.partition(error, middle_error)[middle_error]
+        sure = 1 / (slope * np.sqrt(np.maximum(error, usual / 2 + TINY)))
         sure /= sure.max()
     bend, across, down = found[:LINEAR]
     bend = np.copysign(max(abs(bend), LEAST_BEND), bend)
