@@ -53,7 +53,6 @@ PART_ROWS, LEVEL_ROWS, BENT_ROWS, MAX_PARTS = 1.5, 1.0, 0.5, 6
 LEAST_FILLED = 0.1  # of a pixel's side, by a surface that ends in it
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
-SWEEP_LEFT_FRACTION = 0.15  # of the corrections to a sweep, lines: what is left of its shape
 PACE_PLACES = 16  # one of so many says how long rows take, on average
 PARALLEL_POINTS = 20_000  # threads take as long to begin as so many need
 
@@ -512,14 +511,6 @@ class SurfacePoints:
         variance = np.concatenate([np.sum((m @ c) * m, axis=1) for m, c in known])
         # range = length / inverse depth
         return np.asarray(self.distance**2 / self.ray_length * np.sqrt(variance))
-
-    def estimate_sweep_error(self) -> float:
-        """Return by how much all ranges may be off, m, because the sweep is of another shape than is
-        solved for: a part of what the fit had to correct of it.
-        """
-        # a height is even between -1/2 and 1/2
-        corrected = np.mean(self.state.delays**2 + self.state.stretches**2 / 12)
-        return SWEEP_LEFT_FRACTION * float(np.sqrt(corrected)) * self.row_m
 
     def share_out(self, work: Callable[[range], Result], jobs: int) -> list[Result]:
         """Return ``work(share)`` of each thread's share of all views or surfaces."""

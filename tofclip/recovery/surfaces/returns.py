@@ -8,9 +8,11 @@ from functools import partial
 
 import numpy as np
 import scipy
+from numpy.polynomial import Polynomial
 
 from tofclip.arrays import FloatArray
 from tofclip.camera import Camera
+from tofclip.camera.model import interpolate_linearly
 from tofclip.lidar import Detection
 from tofclip.lidar.range_calibration import correct_returns
 from tofclip.recovery.surfaces.amplitudes import NEIGHBOURHOOD_PX, share_misfit
@@ -49,6 +51,7 @@ ROW_ERROR_PX = 0.02
 SHARED_DOUBT = 0.5
 # Middle of a part of a pixel from the pixel's own, root mean square over parts of all sizes.
 PART_PX = 1 / np.sqrt(12)
+SWEEP_PLACES = 10  # between views' centres, at which a sweep's course is looked at
 
 
 @limit_blas_threads()
@@ -96,7 +99,8 @@ def list_returns(
     hidden = estimate_hidden_shift(model, amplitude)
     bordering = estimate_border_shift(model, amplitude)
     parts = np.stack([fitted, fit.remainder, *moved, bent, rounded, hidden, bordering])
-    deviation = np.sqrt(np.sum(parts**2, axis=0) + model.estimate_sweep_error() ** 2)
+    unswept = estimate_sweep_error(model, amplitude)
+    deviation = np.sqrt(np.sum(parts**2, axis=0) + unswept**2)
     found = Returns(
         y=y.astype(np.int32),
         x=x.astype(np.int32),
@@ -170,16 +174,43 @@ def round_rod(y: Pixels, x: Pixels, light: FloatArray) -> FloatArray:
 
 
 def estimate_hidden_shift(model: SurfaceModel, amplitude: Image) -> FloatArray:
-    """Return how far off points are, (points,), m, because each view sees them through other gaps of
-    what lies before them: another part of the pixel, and where their surface is steep another range.
+    """Return how far off points are, (points,), m, because only a part of a pixel is theirs, and where their surface is
+    steep another range than its middle's: each view sees them through other gaps of what lies before them, and all
+    see what lies behind them through their own.
     """
     order, rank = rank_within_pixels(model.pixel, model.distance)
-    before = np.cumsum(amplitude[order], dtype=np.float64) - amplitude[order]
-    light = np.empty(amplitude.size)
-    light[order] = before - np.maximum.accumulate(np.where(rank == 0, before, 0))
-    fraction = light / np.maximum(light + amplitude, TINY)
-    aside = fraction * PART_PX / np.sqrt(model.camera.views)
-    return np.asarray(aside * np.hypot(*model.compute_slopes()))
+    light = amplitude[order].astype(np.float64)
+    first, pixel = np.flatnonzero(rank == 0), np.cumsum(rank == 0) - 1
+    total = np.add.reduceat(light, first)[pixel]
+    before = np.cumsum(light) - light
+    before -= before[first][pixel]
+    after = total - before - light
+    aside = np.empty(amplitude.size)
+    aside[order] = np.hypot(
+        before / np.sqrt(model.camera.views) / np.maximum(before + light, TINY),
+        after / np.maximum(after + light, TINY),
+    )
+    return np.asarray(PART_PX * aside * np.hypot(*model.compute_slopes()))
+
+
+def estimate_sweep_error(model: SurfaceModel, amplitude: Image) -> float:
+    """Return how far all ranges may be off, m, because the sweep is known at the views' centres and is taken to be a
+    parabola and straight from one to the next beyond it: how far these lines are from a smooth course.
+    """
+    camera, state = model.camera, model.state
+    time = 2 * float(np.average(model.distance, weights=amplitude + TINY)) / SPEED_OF_LIGHT
+    row = np.interp(time + camera.time_zero, model.times, np.arange(float(model.times.size)))
+    late, centres = state.delays + state.stretches * model.measure_height(row), camera.centres_px
+    if camera.sweep is not None:
+        late = late + camera.sweep.raw_position(np.full(centres.size, row), centres)[0]
+    if centres.size <= 3:
+        return 0.0
+    late = late - Polynomial.fit(centres, late, 2)(centres)
+    slit = np.linspace(centres[0], centres[-1], SWEEP_PLACES * centres.size)
+    smooth = scipy.interpolate.CubicSpline(centres, late)(slit)
+    off = smooth - interpolate_linearly(slit, centres, late)
+    # a range is seen by all views
+    return float(np.sqrt(np.mean(off**2) / centres.size)) * model.row_m
 
 
 def _judge_points(fit: SurfaceFit, variance: Image, limit: float) -> tuple[Pixels, FloatArray]:
