@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from surface_scene import BIN_M
 
-from tofclip.recovery.surfaces.growing import bend_patches, find_bodies
+from tofclip.recovery.surfaces.growing import bend_patches, find_bodies, find_halves
 from tofclip.recovery.surfaces.patches import Patch, find_plain_patches
 from tofclip.recovery.surfaces.shapes import (
     QuadricBasis,
@@ -99,6 +99,30 @@ def test_bodies_that_touch_grow_apart():
     for part in parts:
         assert find_bodies([part], bin_m) == []
     assert find_bodies(parts, bin_m) == []
+
+
+def test_the_top_of_a_cup_is_parted_from_its_side():
+    """Of 13 x 6 and 13 x 9 px."""
+    truth, inside, ray_length = meet((0.0, 0.0, 1.5), 0.03, (1, 0, 1))
+    y, x = np.indices(truth.shape)
+    top, side = (y >= 26) & (y < 32), (y >= 32) & (y < 41)
+    truth = np.where(top, 1.47 + 0.012 * (32 - y), truth)
+    within = (np.abs(x - 32) <= 6) & (top | side)
+    pixels, bin_m = np.flatnonzero(within), BIN_M / 4
+    noise = 0.5 * bin_m * np.random.default_rng(0).standard_normal(pixels.size)
+    distance = truth.ravel()[pixels] + noise
+    patch = Patch.fit(pixels, distance, np.full(pixels.size, bin_m), ray_length)
+    owners = [np.mean(top.ravel()[part.pixels]) for part in find_halves(patch, bin_m)]
+    assert sorted(owners) == pytest.approx([0, 1], abs=0.1)
+
+
+def test_what_is_one_body_has_no_halves():
+    truth, inside, ray_length = meet((0.03, -0.02, 1.5), 0.04, (1, 1, 1))
+    pixels, bin_m = np.flatnonzero(inside > 0.1 * inside.max()), BIN_M / 4
+    noise = 0.5 * bin_m * np.random.default_rng(0).standard_normal(pixels.size)
+    distance = truth.ravel()[pixels] + noise
+    patch = Patch.fit(pixels, distance, np.full(pixels.size, bin_m), ray_length)
+    assert find_halves(patch, bin_m) == []
 
 
 @pytest.mark.parametrize("axes", [(1, 1, 1), (1, 0, 1)])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, share_misfit
 from tofclip.recovery.surfaces.extents import LIT_SIGMAS, find_lit, find_steep, take_apart
-from tofclip.recovery.surfaces.growing import find_bodies
+from tofclip.recovery.surfaces.growing import find_bodies, find_halves
 from tofclip.recovery.surfaces.patches import Patch
 from tofclip.recovery.surfaces.pulse import Image
 from tofclip.recovery.surfaces.ranges import take_step
@@ -32,6 +32,8 @@ BODY_MARGIN_PX = 3  # how far one body may reach into the next
 # surfaces, or a quarter of their own (4 to 30 where balls, leaves and tables were one, 45 to 2000 where there were
 # several).
 BODY_STEPS, BODY_ROUNDS, BODY_GAIN = 2, 3, 40.0
+# Halves may be of anything: 0.11 to 0.6 of the light of cups and bent arms, up to 0.05 of heads, leaves and legs.
+HALVES_LIGHT = 0.08
 # As if ranges were that much nearer to bodies: few of these are tried, and more.
 FINER = 0.75, 1.25
 # Surfaces are tried alone, and those together whose ranges differ by less where they touch, if they are few.
@@ -70,6 +72,8 @@ def part_bodies(solver: AmplitudeSolver) -> AmplitudeSolver:
             for finer in FINER:
                 if found := _find_bodies(solver, patches, left, finer):
                     trials += _try_bodies(solver, found)
+        if found := _find_halves(solver, {one: patches[one] for one in doubtful & set(patches)}):
+            trials += _try_bodies(solver, found, HALVES_LIGHT)
         better = dict[Group, list[Body]]()
         for trial in sorted(trials, key=lambda one: -one.gain):
             taken = set(itertools.chain.from_iterable(better))
@@ -129,6 +133,13 @@ def _find_bodies(
     return found
 
 
+def _find_halves(solver: AmplitudeSolver, patches: Mapping[int, Patch]) -> dict[Group, list[Body]]:
+    """The two bodies of which each of some small surfaces may consist."""
+    bin_m, bodies = FOLLOWED_BINS * solver.model.row_m, list_bodies(solver)
+    halves = {one: find_halves(patch, bin_m) for one, patch in patches.items()}
+    return {(one,): _divide(bodies[one], parts) for one, parts in halves.items() if parts}
+
+
 def _unite(bodies: Sequence[Body]) -> Body:
     """The first of some bodies where all are."""
     mask = np.any([one.mask for one in bodies], axis=0)
@@ -154,8 +165,12 @@ def _divide(whole: Body, patches: Sequence[Patch]) -> list[Body]:
     return bodies
 
 
-def _try_bodies(solver: AmplitudeSolver, found: Mapping[Group, list[Body]]) -> list[Trial]:
-    """Take steps on surfaces, and on the bodies that may be in place of each group of them."""
+def _try_bodies(
+    solver: AmplitudeSolver, found: Mapping[Group, list[Body]], of_light: float = 0.0
+) -> list[Trial]:
+    """Take steps on surfaces, and on the bodies that may be in place of each group of them. `of_light`: the part of
+    its light by which a group has to gain.
+    """
     members = sorted(itertools.chain.from_iterable(found))
     place = {one: number for number, one in enumerate(members)}
     own = {tuple(place[one] for one in group): parts for group, parts in found.items()}
@@ -177,7 +192,8 @@ def _try_bodies(solver: AmplitudeSolver, found: Mapping[Group, list[Body]]) -> l
         gain = sum(float(gained[model.parts[one]].sum()) for one in places)
         free = sum(body.coefficients.size for body in bodies)
         freed = sum(before[one].coefficients.size for one in places)
-        gain -= BODY_GAIN * solver.variance * max(free - freed, free / 4)
+        whole = sum(float(before[one].light.sum()) for one in places)
+        gain -= BODY_GAIN * solver.variance * max(free - freed, free / 4) + of_light * whole
         trials.append(Trial(gain, group, bodies))
     return trials
 

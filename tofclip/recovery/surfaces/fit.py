@@ -203,7 +203,8 @@ def _fit_ranges(
     tick: Tick = lambda: None,
 ) -> tuple[AmplitudeSolver, Refinement, FloatArray]:
     """Fit ranges, and straighten splines that are not needed first: these take longer to be right, and late views
-    give way to them. Which surfaces are several shows once they are nearly right. `begun` stays as it is.
+    give way to them. Which surfaces are several shows once they are nearly right, and again once they are. `begun`
+    stays as it is.
     """
     solver = AmplitudeSolver(copy.copy(begun.model), begun.amplitude, begun.weight, begun)
     solver.model.find_behind(solver.amplitude)
@@ -218,7 +219,11 @@ def _fit_ranges(
         solver = keep_lit(grown)
         refinement = refinement.cover(solver.model)
         _approach_steep(solver, darkness)
-    return solver, *_refine(solver, refinement, tick)
+    refined = _refine(solver, refinement, tick)
+    if darkness <= DIM and (grown := part_bodies(solver)) is not solver:
+        solver = keep_lit(grown)
+        refined = _refine(solver, refined[0].cover(solver.model), tick)
+    return solver, *refined
 
 
 def _measure_pulse(solver: AmplitudeSolver, least_tail: float = LEAST_TAIL) -> AmplitudeSolver:

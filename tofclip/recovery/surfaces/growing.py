@@ -4,7 +4,7 @@ order, and each grows from a few points on as far as returns are near it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -30,6 +30,7 @@ NEARER, SURELY_NEARER = 0.75, 1 / 3
 # How many bodies are begun at most, or one in each square of `NEIGHBOURS_PX`; how near returns have to be, with those
 # beside them, that a body grows over; how far a body may reach over others; and how often.
 SEEDS, GROWN_BINS, BESIDE_PX, REACH_PX, ROUNDS = 50, 2.0, 3, 3, 8
+HALVED_PX = 1000  # patches of no more are halved where none grow
 
 
 Box = tuple[slice, slice]  # rows and columns
@@ -61,14 +62,26 @@ def find_bodies(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
     on; at last each return goes to the body that is nearest. What grew may be several bodies itself.
     """
     whole = _join_returns(patches)
-    error = _measure_distance(patches if len(patches) > 1 else [_make_round(whole, bin_m)], bin_m)
+    error = _measure_error(patches if len(patches) > 1 else [_make_round(whole, bin_m)], bin_m)
     if error < BEND_BINS * bin_m or whole.pixels.size < 2 * MIN_PATCH_PX:
         return []
-    bodies = _Area(whole, bin_m).find_bodies()
-    parts = [_make_round(whole.take(own), bin_m) for own in bodies]
-    if len(parts) < 2 or _measure_distance(parts, bin_m) >= NEARER * error:
+    parts = _take(whole, _Area(whole, bin_m).grow_bodies(), bin_m)
+    if len(parts) < 2 or _measure_error(parts, bin_m) >= NEARER * error:
         return []
     return [one for part in parts for one in find_bodies([part], bin_m) or [part]]
+
+
+def find_halves(patch: Patch, bin_m: float) -> list[Patch]:
+    """Return the two bodies of which a small patch may consist, or none: each begins with a half of it. There is no
+    room for any to grow from its middle in the top of a cup.
+    """
+    whole = _make_round(_join_returns([patch]), bin_m)
+    error = _measure_error([whole], bin_m)
+    if error < BEND_BINS * bin_m or not 2 * MIN_PATCH_PX <= whole.pixels.size <= HALVED_PX:
+        return []
+    tried = [_take(whole, own, bin_m) for own in _Area(whole, bin_m).halve()]
+    parts = max(tried, key=lambda one: _measure_size(one, bin_m))
+    return parts if len(parts) > 1 and _measure_error(parts, bin_m) < NEARER * error else []
 
 
 def _join_returns(patches: Sequence[Patch]) -> Patch:
@@ -83,20 +96,30 @@ def _join_returns(patches: Sequence[Patch]) -> Patch:
     return Patch.fit(pixels[own], distance[own], deviation[own], patches[0].ray_length)
 
 
+def _take(whole: Patch, bodies: Sequence[NDArray[np.bool_]], bin_m: float) -> list[Patch]:
+    return [_make_round(whole.take(own), bin_m) for own in bodies]
+
+
 def _make_round(patch: Patch, bin_m: float) -> Patch:
     """A patch with a surface of second order if its returns need it and are nearer to that."""
-    if _measure_distance([patch], bin_m) < BEND_BINS * bin_m:
+    if _measure_error([patch], bin_m) < BEND_BINS * bin_m:
         return patch
     inverse = patch.ray_length.ravel()[patch.pixels] / patch.distance
     basis, coefficients = guess_quadric(patch.pixels, inverse, patch.basis.image_shape)
     curved = replace(patch, basis=basis, coefficients=coefficients)
-    return min(patch, curved, key=lambda one: _measure_distance([one], bin_m))
+    return min(patch, curved, key=lambda one: _measure_error([one], bin_m))
 
 
-def _measure_distance(patches: Sequence[Patch], bin_m: float) -> float:
+def _measure_error(patches: Sequence[Patch], bin_m: float) -> float:
     """Mean distance of returns from the surfaces of their patches; none counts for more than a few bins."""
     distances = np.concatenate([patch.compute_distances() for patch in patches])
     return float(np.mean(np.minimum(distances, SPLIT_BINS * bin_m)))
+
+
+def _measure_size(patches: Sequence[Patch], bin_m: float) -> float:
+    """How many returns patches have, the less the farther they are off."""
+    number = sum(patch.pixels.size for patch in patches)
+    return number * (1 - _measure_error(patches, bin_m) / (SPLIT_BINS * bin_m)) if number else 0
 
 
 class _Area:
@@ -114,9 +137,17 @@ class _Area:
         self.corner = int(row.min()), int(column.min())
         self.side = max(NEIGHBOURS_PX, round(float(np.sqrt(row.size / SEEDS))))
 
-    def find_bodies(self) -> list[NDArray[np.bool_]]:
-        """Say which returns are of which body, (n,) each."""
-        return [own[self.place] for own in self._settle(self._grow_bodies())]
+    def grow_bodies(self) -> list[NDArray[np.bool_]]:
+        """Say which returns are of which body that grows, (n,) each."""
+        return self._settle(self._grow_bodies())
+
+    def halve(self) -> Iterator[list[NDArray[np.bool_]]]:
+        """Yield what becomes of some pairs of halves, (n,) each."""
+        middle = [float(one.mean()) for one in self.place]
+        down, right = np.indices(self.free.shape) - np.reshape(middle, (2, 1, 1))
+        for way in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            half = way[0] * down + way[1] * right > 0
+            yield self._settle([self.free & half, self.free & ~half])
 
     def _grow_bodies(self) -> list[NDArray[np.bool_]]:
         """Bodies, the largest first, none of which has returns of another."""
@@ -177,7 +208,9 @@ class _Area:
             if all((one == other).all() for one, other in zip(before, bodies, strict=True)):
                 break
             bodies = [own for own in bodies if np.count_nonzero(own) >= MIN_PATCH_PX]
-        return bodies
+            if not bodies:
+                break
+        return [own[self.place] for own in bodies]
 
     def _measure_off(self, own: NDArray[np.bool_], about: Box) -> FloatArray:
         """How far the returns of a box, and those beside them, are off the surface of some, m; none counts for more
