@@ -103,7 +103,7 @@ def test_bodies_that_touch_grow_apart():
 
 def test_the_top_of_a_cup_is_parted_from_its_side():
     """Of 13 x 6 and 13 x 9 px."""
-    truth, inside, ray_length = meet((0.0, 0.0, 1.5), 0.03, (1, 0, 1))
+    truth, _, ray_length = meet((0.0, 0.0, 1.5), 0.03, (1, 0, 1))
     y, x = np.indices(truth.shape)
     top, side = (y >= 26) & (y < 32), (y >= 32) & (y < 41)
     truth = np.where(top, 1.47 + 0.012 * (32 - y), truth)
