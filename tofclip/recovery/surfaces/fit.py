@@ -203,25 +203,25 @@ def _fit_ranges(
     tick: Tick = lambda: None,
 ) -> tuple[AmplitudeSolver, Refinement, FloatArray]:
     """Fit ranges, and straighten splines that are not needed first: these take longer to be right, and late views
-    give way to them. Which surfaces are several shows once they are nearly right, and again once they are. `begun`
-    stays as it is.
+    give way to them. Which surfaces are several shows once they are nearly right, and where some are, again once
+    all are. `begun` stays as it is.
     """
     solver = AmplitudeSolver(copy.copy(begun.model), begun.amplitude, begun.weight, begun)
     solver.model.find_behind(solver.amplitude)
     solver, straightened = straighten_surfaces(solver)
     _approach_steep(solver, darkness)
     refinement, _ = _refine(solver, straightened, tick, least=MIN_REFINEMENTS, most=MIN_REFINEMENTS)
-    grown = add_surfaces(solver, *shown)
-    if darkness <= DIM:  # ranges that follow the shot point by point follow noise otherwise
-        grown = part_bodies(grown)
-    grown = grow_surfaces(grown)
+    added = add_surfaces(solver, *shown)
+    # ranges that follow the shot point by point follow noise otherwise
+    parted = part_bodies(added) if darkness <= DIM else added
+    grown = grow_surfaces(parted)
     if grown is not solver:
         solver = keep_lit(grown)
         refinement = refinement.cover(solver.model)
         _approach_steep(solver, darkness)
     refined = _refine(solver, refinement, tick)
-    if darkness <= DIM and (grown := part_bodies(solver)) is not solver:
-        solver = keep_lit(grown)
+    if parted is not added and (again := part_bodies(solver)) is not solver:
+        solver = keep_lit(again)
         refined = _refine(solver, refined[0].cover(solver.model), tick)
     return solver, *refined
 
