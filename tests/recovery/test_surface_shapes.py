@@ -125,6 +125,14 @@ def test_what_is_one_body_has_no_halves():
     assert find_halves(patch, bin_m) == []
 
 
+def test_what_is_a_row_high_is_halved_along_it():
+    pixels, ray_length, bin_m = np.arange(640, 704), np.ones((64, 64)), BIN_M / 4
+    distance = 1.5 + np.where(pixels < 670, 0.0, 12 * bin_m)
+    patch = Patch.fit(pixels, distance, np.full(pixels.size, bin_m), ray_length)
+    first, second = sorted(find_halves(patch, bin_m), key=lambda part: int(part.pixels[0]))
+    assert first.pixels.max() < 670 <= second.pixels.min()
+
+
 @pytest.mark.parametrize("axes", [(1, 1, 1), (1, 0, 1)])
 def test_the_nearest_round_surface_does_not_follow_what_is_off(axes):
     truth, inside, ray_length = meet((0.03, -0.02, 1.5), 0.12, axes)

@@ -32,7 +32,6 @@ NEARER, SURELY_NEARER = 0.75, 1 / 3
 SEEDS, GROWN_BINS, BESIDE_PX, REACH_PX, ROUNDS = 50, 2.0, 3, 3, 8
 HALVED_PX = 1000  # patches of no more are halved where none grow
 
-
 Box = tuple[slice, slice]  # rows and columns
 
 
@@ -147,7 +146,9 @@ class _Area:
         down, right = np.indices(self.free.shape) - np.reshape(middle, (2, 1, 1))
         for way in ((1, 0), (0, 1), (1, 1), (1, -1)):
             half = way[0] * down + way[1] * right > 0
-            yield self._settle([self.free & half, self.free & ~half])
+            halves = self.free & half, self.free & ~half
+            # of a level wire one may be nothing
+            yield self._settle([one for one in halves if np.count_nonzero(one) >= MIN_PATCH_PX])
 
     def _grow_bodies(self) -> list[NDArray[np.bool_]]:
         """Bodies, the largest first, none of which has returns of another."""
