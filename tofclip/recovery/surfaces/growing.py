@@ -30,7 +30,7 @@ NEARER, SURELY_NEARER = 0.75, 1 / 3
 # How many bodies are begun at most, or one in each square of `NEIGHBOURS_PX`; how near returns have to be, with those
 # beside them, that a body grows over; how far a body may reach over others; and how often.
 SEEDS, GROWN_BINS, BESIDE_PX, REACH_PX, ROUNDS = 50, 2.0, 3, 3, 8
-HALVED_PX = 1000  # patches of no more are halved where none grow
+HALVED_PX = 1000  # patches of no more are halved
 
 Box = tuple[slice, slice]  # rows and columns
 
@@ -130,10 +130,11 @@ class _Area:
         self.place = row - row.min(), column - column.min()
         self.free = np.zeros([int(one.max()) + 1 for one in self.place], bool)
         self.free[self.place] = True
+        self.pixel = np.zeros(self.free.shape, np.intp)
+        self.pixel[self.place] = patch.pixels
         self.distance, self.ray_length = np.ones((2, *self.free.shape))
         self.distance[self.place] = patch.distance
         self.ray_length[self.place] = patch.ray_length[row, column]
-        self.corner = int(row.min()), int(column.min())
         self.side = max(NEIGHBOURS_PX, round(float(np.sqrt(row.size / SEEDS))))
 
     def grow_bodies(self) -> list[NDArray[np.bool_]]:
@@ -217,18 +218,10 @@ class _Area:
         """How far the returns of a box, and those beside them, are off the surface of some, m; none counts for more
         than a few bins.
         """
-        columns = self.patch.ray_length.shape[1]
-        row, column = (first + one for first, one in zip(self.corner, np.nonzero(own), strict=True))
         inverse = self.ray_length[own] / self.distance[own]
-        shape = self.patch.basis.image_shape
-        basis, found = guess_quadric(row * columns + column, inverse, shape)
+        basis, found = guess_quadric(self.pixel[own], inverse, self.patch.basis.image_shape)
         seen, off = self.free[about], np.zeros(self.free[about].shape)
-        row, column = np.nonzero(seen)
-        row, column = (
-            row + about[0].start + self.corner[0],
-            column + about[1].start + self.corner[1],
-        )
-        inverse = basis.compute_inverse(basis.evaluate(row * columns + column), found)
+        inverse = basis.compute_inverse(basis.evaluate(self.pixel[about][seen]), found)
         away = self.ray_length[about][seen] / np.maximum(inverse, TINY)
         away = np.abs(away - self.distance[about][seen])
         off[seen] = np.minimum(away, SPLIT_BINS * self.bin_m)

@@ -198,13 +198,13 @@ def estimate_sweep_error(model: SurfaceModel, amplitude: Image) -> float:
     parabola and straight from one to the next beyond it: how far these lines are from a smooth course.
     """
     camera, state = model.camera, model.state
+    if camera.views <= 3:  # a parabola goes through all
+        return 0.0
     time = 2 * float(np.average(model.distance, weights=amplitude + TINY)) / SPEED_OF_LIGHT
     row = np.interp(time + camera.time_zero, model.times, np.arange(float(model.times.size)))
     late, centres = state.delays + state.stretches * model.measure_height(row), camera.centres_px
     if camera.sweep is not None:
         late = late + camera.sweep.raw_position(np.full(centres.size, row), centres)[0]
-    if centres.size <= 3:
-        return 0.0
     late = late - Polynomial.fit(centres, late, 2)(centres)
     slit = np.linspace(centres[0], centres[-1], SWEEP_PLACES * centres.size)
     smooth = scipy.interpolate.CubicSpline(centres, late)(slit)
