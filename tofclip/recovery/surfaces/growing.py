@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import FloatArray
 from tofclip.recovery.surfaces.patches import (
     BEND_BINS,
+    CORRELATED_PX,
     MIN_PATCH_PX,
     NEIGHBOURS_PX,
     SPLIT_BINS,
@@ -27,6 +28,7 @@ from tofclip.recovery.surfaces.shapes import ROUND_COEFFICIENTS, TINY, guess_qua
 # to be without more ado: persons, leaves and letters have 0.1 to 0.33, balls and melons, whose returns are displaced,
 # 0.335 to 0.7.
 NEARER, SURELY_NEARER = 0.75, 1 / 3
+ALL_NOISE = 0.67  # median distance of returns from their surface, in their deviations: a wall's in little light
 # How many bodies are begun at most, or one in each square of `NEIGHBOURS_PX`; how near returns have to be, with those
 # beside them, that a body grows over; how far a body may reach over others; and how often.
 SEEDS, GROWN_BINS, BESIDE_PX, REACH_PX, ROUNDS = 50, 2.0, 3, 3, 8
@@ -45,7 +47,9 @@ def bend_patches(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
 
 def _bend(patch: Patch, bin_m: float) -> list[Patch]:
     bent = bend_where_needed(patch, bin_m)
-    if bent.compute_error() < BEND_BINS * bin_m:
+    unsure = np.sqrt(CORRELATED_PX / patch.pixels.size)  # of so few returns
+    noisy = (1 + unsure) * bent.compute_misfit(bent) < ALL_NOISE
+    if bent.compute_error() < BEND_BINS * bin_m or noisy:
         return [bent]
     # what is algebraically nearest is off where frames' returns at a limb are too near
     parts = [part.take(slice(None)) for part in find_bodies([patch], bin_m)]
