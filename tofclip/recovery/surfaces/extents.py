@@ -25,6 +25,9 @@ from tofclip.recovery.surfaces.shapes import Pixels
 # be the other's
 DOUBLE_FRACTION, DOUBLE_BINS, DOUBLE_PX = 0.2, 7.0, 3.0
 MIN_BRIGHTNESS_FRACTION = 0.1  # of the surface's usual brightness: fainter is not looked at
+# Of it, and of the deviations that a pixel alone needs, for a point that its neighbours speak for: of the returns that
+# were missed in 50 photons a fifth stood out of the noise by three to five.
+AS_BRIGHT, NEEDED = 0.5, 0.6
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
 # Of what certainly is a surface, and beyond: points that are fainter are looked at no further.
@@ -115,12 +118,13 @@ def find_candidates(
     solver: AmplitudeSolver, significance: Image, limit: float
 ) -> NDArray[np.bool_]:
     """Say which points stand out of the noise, by their significance, and are not far fainter than
-    their surface.
+    their surface. Those that are as bright as it is need less: their neighbours speak for them.
     """
     model, amplitude = solver.model, solver.amplitude
     usual = [find_usual_brightness(amplitude[p], significance[p], limit) for p in model.parts]
-    faint = amplitude <= MIN_BRIGHTNESS_FRACTION * np.array(usual)[model.surface]
-    return np.asarray((significance > limit) & ~faint)
+    part = np.where(significance > limit, MIN_BRIGHTNESS_FRACTION, AS_BRIGHT)
+    bright = amplitude > part * np.array(usual)[model.surface]
+    return np.asarray((significance > NEEDED * limit) & bright)
 
 
 def find_usual_brightness(amplitude: Image, significance: Image, limit: float) -> float:

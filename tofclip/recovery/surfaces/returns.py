@@ -29,9 +29,6 @@ from tofclip.shots import Returns
 from tofclip.threads import limit_blas_threads
 from tofclip.units import FWHM_PER_SIGMA, SPEED_OF_LIGHT
 
-# Of the deviations that a pixel alone needs, for a point that its neighbours speak for: the odds of being false say
-# the rest. In 50 photons a fifth of what was missed stood out of the noise by 3 to 5.
-NEEDED = 0.6
 # Logarithm of the odds that a surface's point is false: nothing known, for each e-fold of the deviations
 # by which it is out of the noise, where the frames have returns beside all points about it, for each
 # e-fold of the part of its surface's light that may as well lie elsewhere, of the number of the surface's
@@ -72,7 +69,7 @@ def list_returns(
     distance, others = model.distance, fit.others
     # 6. Points.
     variance = fit.solver.estimate_local_variance()
-    bright, doubt = _judge_points(fit, variance, NEEDED * detection.signal_to_noise)
+    bright, doubt = _judge_points(fit, variance, detection.signal_to_noise)
     # brightness is told as the reference view sees it
     intensity = model.shade(model.reference, amplitude) * distance**2
     time = 2 * distance / SPEED_OF_LIGHT
