@@ -240,7 +240,7 @@ def test_a_table_in_little_light_is_found_as_far_as_it_reaches():
 
 def test_a_plate_whose_pixels_show_nothing_alone_is_found_in_fifty_photons():
     """Frames, and means over a few pixels, show six of its 366 returns, means over more a tenth: 0.19 of the
-    room's returns were missed. Rooms of two seeds have 0.012 and 0.017.
+    room's returns were missed. Rooms of two seeds have 0.017 and 0.024.
     """
     shot = make_shot("room", seed=9, photons=50, size=64)
     _, score = recover_shot(shot, shot.camera)
