@@ -118,7 +118,7 @@ def find_candidates(
     solver: AmplitudeSolver, significance: Image, limit: float
 ) -> NDArray[np.bool_]:
     """Say which points stand out of the noise, by their significance, and are not far fainter than
-    their surface. Those that are as bright as it is need less: their neighbours speak for them.
+    their surface. Those that are half as bright as it is need less: their neighbours speak for them.
     """
     model, amplitude = solver.model, solver.amplitude
     usual = [find_usual_brightness(amplitude[p], significance[p], limit) for p in model.parts]

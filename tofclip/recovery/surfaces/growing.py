@@ -47,9 +47,7 @@ def bend_patches(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
 
 def _bend(patch: Patch, bin_m: float) -> list[Patch]:
     bent = bend_where_needed(patch, bin_m)
-    unsure = np.sqrt(CORRELATED_PX / patch.pixels.size)  # of so few returns
-    noisy = (1 + unsure) * bent.compute_misfit(bent) < ALL_NOISE
-    if bent.compute_error() < BEND_BINS * bin_m or noisy:
+    if bent.compute_error() < BEND_BINS * bin_m or _is_noise(bent):
         return [bent]
     # what is algebraically nearest is off where frames' returns at a limb are too near
     parts = [part.take(slice(None)) for part in find_bodies([patch], bin_m)]
@@ -57,6 +55,12 @@ def _bend(patch: Patch, bin_m: float) -> list[Patch]:
     left = [distance for part in parts for distance in part.compute_distances()]
     sure = len(parts) > 1 and np.median(left) < SURELY_NEARER * bent.compute_error()
     return parts if sure else [bent]
+
+
+def _is_noise(patch: Patch) -> bool:
+    """Whether returns are no farther from their surface than their deviations say, as surely as so many tell."""
+    unsure = np.sqrt(CORRELATED_PX / patch.pixels.size)
+    return bool((1 + unsure) * patch.compute_misfit(patch) < ALL_NOISE)
 
 
 def find_bodies(patches: Sequence[Patch], bin_m: float) -> list[Patch]:
@@ -78,9 +82,11 @@ def find_halves(patch: Patch, bin_m: float) -> list[Patch]:
     """Return the two bodies of which a small patch may consist, or none: each begins with a half of it. There is no
     room for any to grow from its middle in the top of a cup.
     """
-    whole = _make_round(_join_returns([patch]), bin_m)
+    if not 2 * MIN_PATCH_PX <= patch.pixels.size <= HALVED_PX:
+        return []
+    whole = _make_round(patch.take(slice(None)), bin_m)
     error = _measure_error([whole], bin_m)
-    if error < BEND_BINS * bin_m or not 2 * MIN_PATCH_PX <= whole.pixels.size <= HALVED_PX:
+    if error < BEND_BINS * bin_m:
         return []
     tried = [_take(whole, own, bin_m) for own in _Area(whole, bin_m).halve()]
     parts = max(tried, key=lambda one: _measure_size(one, bin_m))

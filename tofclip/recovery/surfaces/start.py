@@ -40,9 +40,10 @@ from tofclip.units import SPEED_OF_LIGHT
 SURE_FALSE_ALARM = 0.04  # of a return that makes a surface
 MIN_SURE_FRACTION = 0.8  # of a patch's returns
 # Of the signal, noise that hides surfaces from single pixels (0.05 to 0.1 in 200 photons, 0.2 to 0.7 in 50), and
-# the standard deviation of the mean over pixels that is then looked at; where it is dark those of further ones,
-# one after the other: some surfaces show in a few pixels, others in a hundred.
-DIM, DARK, POOLED_PX, FURTHER_PX = 0.05, 0.15, (0.7,), (1.4, 2.8)
+# the standard deviations of means over pixels that are then looked at, one after the other, each from how much
+# noise on: some surfaces show in a few pixels, others in a hundred.
+DIM, DARK = 0.05, 0.15
+POOLED_PX = ((0.7, DIM), (1.4, DARK), (2.8, DARK))
 
 # Of the returns' light: below, the shot is not one of surfaces. Simulated shots of surfaces have 0.93
 # or more, recorded ones 0.97; recorded relay walls have 0.50 to 0.79.
@@ -78,9 +79,9 @@ def find_surfaces(
 
     # 2. Patches.
     shown = _leave_out_doubtful(found, ray_length, bin_m)
-    pooled_px = (darkness > DIM) * POOLED_PX + (darkness > DARK) * FURTHER_PX
-    for sigma_px in pooled_px:
-        shown = _add_pooled(shown, frames, sigma_px, ray_length, bin_m)
+    for sigma_px, least in POOLED_PX:
+        if darkness > least:
+            shown = _add_pooled(shown, frames, sigma_px, ray_length, bin_m)
     patches = find_brightest_patches(shown, ray_length, bin_m)
     on_surface = np.zeros(camera.image_shape, bool)
     for patch in patches:
