@@ -271,21 +271,22 @@ def scale_amplitude(model: SurfaceModel, lit: NDArray[np.bool_]) -> Image:
 
 
 def explain_by_amplitude(
-    model: SurfaceModel, image: Image, start: Image, scale: Image, iterations: int
-) -> Image:
+    model: SurfaceModel, image: Image, scale: Image, iterations: int
+) -> tuple[Image, Image]:
     """Return the change of amplitude x that lowers ``|image - A x|_w`` most, by conjugate gradients
-    in the scale of `scale_amplitude` from one to start at.
+    in the scale of `scale_amplitude`, and what is left of the image.
     """
-    change = start.copy()
-    residual = -scale * model.pull(change, image)
-    direction, energy = residual.copy(), float(np.sum(residual**2, dtype=np.float64))
+    change, direction, before, rest = np.zeros_like(scale), np.zeros_like(scale), 1.0, image.copy()
     for _ in range(iterations):
+        pull = scale * model.gather(model.weights * rest)
+        energy = float(np.sum(pull**2, dtype=np.float64))
         if energy == 0:
             break
-        product = scale * model.pull(scale * direction)
-        length = energy / float(np.sum(direction * product, dtype=np.float64))
-        change += np.float32(length) * scale * direction
-        residual -= np.float32(length) * product
-        before, energy = energy, float(np.sum(residual**2, dtype=np.float64))
-        direction = residual + np.float32(energy / before) * direction
-    return change
+        direction = pull + np.float32(energy / before) * direction
+        light = model.render(scale * direction)
+        length = np.float32(energy / max(float(np.vdot(model.weights * light, light)), TINY))
+        change += length * scale * direction
+        light *= length
+        rest -= light
+        before = energy
+    return change, rest

@@ -21,6 +21,7 @@ from tofclip.recovery.surfaces.amplitudes import (
     START_ITERATIONS,
     AmplitudeSolver,
     Tick,
+    explain_by_amplitude,
     scale_amplitude,
 )
 from tofclip.recovery.surfaces.bodies import part_bodies
@@ -44,7 +45,6 @@ from tofclip.recovery.surfaces.pulse import (
 from tofclip.recovery.surfaces.ranges import (
     FURTHER_FREE_ITERATIONS,
     Refinement,
-    explain_rest,
     refine_state,
     take_step,
 )
@@ -243,9 +243,9 @@ def _measure_blur(solver: AmplitudeSolver) -> AmplitudeSolver:
 
     def find_misfit(sigma_px: float) -> float:
         blurred = model.blur(sigma_px)
-        error, none = blurred.image - blurred.render(amplitude), np.zeros_like(amplitude)
+        error = blurred.image - blurred.render(amplitude)
         scale = scale_amplitude(blurred, amplitude > 0)
-        _, rest = explain_rest(blurred, error, none, scale, FURTHER_FREE_ITERATIONS)
+        _, rest = explain_by_amplitude(blurred, error, scale, FURTHER_FREE_ITERATIONS)
         return float(np.sum(model.weights * rest**2, dtype=np.float64))
 
     misfits: list[float] = []

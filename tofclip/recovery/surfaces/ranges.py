@@ -347,11 +347,12 @@ def refine_state(
 
     # 1. The prior leaves amplitudes a little too even. That looks like views that are late, but not
     # once amplitudes have explained what they can.
-    excess, iterations = np.zeros_like(amplitude), FREE_ITERATIONS
+    excess, rest, iterations = np.zeros_like(amplitude), error, FREE_ITERATIONS
     if earlier is not None and earlier.free is not None:
         excess = np.where(scale > 0, earlier.free - amplitude, np.float32(0))
-        iterations = FURTHER_FREE_ITERATIONS
-    excess, rest = explain_rest(model, error, excess, scale, iterations)
+        rest, iterations = error - model.render(excess), FURTHER_FREE_ITERATIONS
+    change, rest = explain_by_amplitude(model, rest, scale, iterations)
+    excess += change
 
     # 2. As long as ranges are off by much, late views would take a part of it: ranges go first.
     groups = [
@@ -385,7 +386,7 @@ def refine_state(
         covariance += PULL_SIGMAS**2 * np.outer(pull, pull)
 
     # 4. The step's length.
-    moved, free, rest = _go_ahead(model, amplitude, (error, excess, scale), names, newton, changes)
+    moved, free, rest = _go_ahead(model, amplitude, (rest, excess, scale), names, newton, changes)
     numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
     own = [np.ix_(numbers == surface, numbers == surface) for surface in range(len(model.masks))]
     covariances = [covariance[block] for block in own]
@@ -418,14 +419,14 @@ def _go_ahead(
 ) -> tuple[Image, Image, Image]:
     """Move the model as far along a step as each surface's own misfit allows: those that explain less than
     before go less far, and do not hold the others back. Return the amplitudes that go along, those that
-    explain the shot best then, and what is left of it. `begun`: before the step, the misfit, what
-    amplitudes change to explain it, and their scales.
+    explain the shot best then, and what is left of it. `begun`: before the step, what is left of the
+    misfit, what amplitudes change to explain it, and their scales.
 
     There are as many iterations before the step as after it, so that these alone do not make it good. A
     step that is far too long may overflow: it is refused like others that lower nothing.
     """
-    state, (error, excess, scale) = model.state, begun
-    settled, rest = explain_rest(model, error, excess, scale, MOVED_FREE_ITERATIONS)
+    state, (rest, excess, scale) = model.state, begun
+    settled, rest = explain_by_amplitude(model, rest, scale, MOVED_FREE_ITERATIONS)
     before = compute_objective(model, rest)
     ranges = "coefficients", "patterns", "shading"
     owners = np.array([one if name in ranges else len(model.parts) for name, one, _ in names])
@@ -434,18 +435,18 @@ def _go_ahead(
         for _ in range(TRIES):
             parts = np.array(PARTS)[tries]
             ahead = _move(model, state, amplitude, names, parts[owners] * newton, changes)
-            light = model.render(ahead)
-            change, left = explain_rest(
-                model, model.image - light, excess, scale, MOVED_FREE_ITERATIONS
-            )
+            free = ahead + excess
+            left = model.image - model.render(free)
+            change, left = explain_by_amplitude(model, left, scale, MOVED_FREE_ITERATIONS)
             if compute_objective(model, left) < before + SAYS_NOTHING:
-                return ahead, ahead + change, left
-            lost = share_misfit(model, ahead, light, model.weights * (left**2 - rest**2))
+                return ahead, free + change, left
+            lost = model.weights * (left**2 - rest**2)
+            lost = share_misfit(model, ahead, model.render(ahead), lost)
             losses = np.bincount(model.surface, lost, parts.size) * (parts > 0)
             further = ~(losses <= SHORTENING_LOSS * losses.max()) | (losses.max() <= 0)
             tries = np.minimum(tries + further, len(PARTS) - 1)
     model.place(state)
-    return amplitude, amplitude + settled, rest
+    return amplitude, amplitude + excess + settled, rest
 
 
 def doubt_borders(model: SurfaceModel, amplitude: Image) -> Image:
@@ -475,14 +476,6 @@ def delay_light(model: SurfaceModel) -> SurfaceModel:
         for kernel, place in pairs
     ]
     return apart
-
-
-def explain_rest(
-    model: SurfaceModel, error: Image, change: Image, scale: Image, iterations: int
-) -> tuple[Image, Image]:
-    """The change of amplitude that explains a misfit best, begun at `change`, and what is left."""
-    change = explain_by_amplitude(model, error, change, scale, iterations)
-    return change, error - model.render(change)
 
 
 def _leave_out_even_shading(
@@ -545,7 +538,9 @@ def _eliminate_amplitude(
     for number, (image, change) in enumerate(zip(images, changes, strict=False)):
         # quadrics have more of them than others: theirs alone change amplitudes then
         free = np.where(counts > number, scale, np.float32(0))
-        change[:] = explain_by_amplitude(model, image, change, free, iterations)
+        if change.any():
+            image = image - model.render(change)
+        change += explain_by_amplitude(model, image, free, iterations)[0]
         if start is None and number == 0:
             # a smooth multiple of a derivative takes nearly that multiple of its change
             for surface, (functions, _) in enumerate(shares):

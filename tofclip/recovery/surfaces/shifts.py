@@ -11,10 +11,14 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.arrays import FloatArray
-from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver, scale_amplitude
+from tofclip.recovery.surfaces.amplitudes import (
+    AmplitudeSolver,
+    explain_by_amplitude,
+    scale_amplitude,
+)
 from tofclip.recovery.surfaces.model import SurfaceModel
 from tofclip.recovery.surfaces.pulse import TINY, Image
-from tofclip.recovery.surfaces.ranges import MOVED_FREE_ITERATIONS, delay_light, explain_rest
+from tofclip.recovery.surfaces.ranges import MOVED_FREE_ITERATIONS, delay_light
 
 # Of local shifts: the side of the square that moves together, and the least that is known of one.
 LOCAL_PX, LEAST_INFORMATION = 5, 1.0
@@ -90,6 +94,6 @@ def follow_local_shifts(
     product = scipy.sparse.linalg.LinearOperator((2 * light.size,) * 2, multiply, dtype=np.float32)
     # what the prior took from amplitudes is not late
     scale = scale_amplitude(model, light > 0)
-    _, late = explain_rest(model, rest, np.zeros_like(light), scale, MOVED_FREE_ITERATIONS)
+    _, late = explain_by_amplitude(model, rest, scale, MOVED_FREE_ITERATIONS)
     found, _ = scipy.sparse.linalg.cg(product, pull(late), maxiter=LOCAL_ITERATIONS)
     return np.asarray(spread(usual * found[: light.size]))
