@@ -105,7 +105,7 @@ def test_a_part_of_a_pixel_falls_on_the_slit_as_its_rectangle_does(tangent: floa
     places = np.linspace(20.0, 21.0, 9)
     first, shares = np.empty(places.size, np.int32), np.empty((places.size, 4), np.float32)
     wide, high = (np.full(places.size, side) for side in sides)
-    split_over_slit(places, wide, high, tangent, first, shares)
+    split_over_slit(places, wide, high, tangent, 40, first, shares)
     columns = first[:, np.newaxis] + np.arange(4)
     np.testing.assert_allclose(shares.sum(axis=1), 1, rtol=1e-6)
     # what is narrower than a slit pixel has its middle only on average
@@ -142,7 +142,9 @@ def test_a_pulse_between_rows_is_the_pulse_over_each_row():
     from tofclip.recovery.surfaces.kernels import split_between_rows
 
     sigma, places = 1.27, np.linspace(19.5, 20.5, 11)
-    first, shares = split_between_rows(places)
+    first, shares = np.empty(places.size, np.int32), np.empty((places.size, 3), np.float32)
+    whole = np.ones(places.size, np.float32)
+    split_between_rows(places, whole, 10, first, shares, np.zeros(61, bool))
     edges = np.arange(42) - 0.5
     for place, start, share in zip(places, first, shares, strict=True):
         light = np.zeros(41)

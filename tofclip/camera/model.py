@@ -182,12 +182,14 @@ def interpolate_linearly(position: FloatArray, knots: FloatArray, values: FloatA
     if knots.size == 1:
         return np.full(np.shape(position), values[0])
     # np.interp would hold the values of the outer knots: there are some where no position is
-    slopes, far = np.diff(values) / np.diff(knots), FAR_SPANS * (knots[-1] - knots[0])
-    values = np.concatenate(
-        [[values[0] - far * slopes[0]], values, [values[-1] + far * slopes[-1]]]
-    )
-    knots = np.concatenate([[knots[0] - far], knots, [knots[-1] + far]])
-    return np.asarray(np.interp(position, knots, values))
+    far = FAR_SPANS * (knots[-1] - knots[0])
+    beyond, reached = np.empty((2, knots.size + 2))
+    beyond[1:-1], reached[1:-1] = knots, values
+    for end, inner, way in ((0, 1, -far), (-1, -2, far)):
+        beyond[end] = knots[end] + way
+        slope = (values[inner] - values[end]) / (knots[inner] - knots[end])
+        reached[end] = values[end] + way * slope
+    return np.asarray(np.interp(position, beyond, reached))
 
 
 # Mean over three set-ups of the same family of instruments (244, 271 and 282 px), fitted to the measured

@@ -15,48 +15,63 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.compiling import ONE, compile_loop
+from tofclip.compiling import ONE, SUMS_IN_ANY_ORDER, compile_loop
 
 Image = NDArray[np.float32]
 
 fast_loop = compile_loop(fastmath=True)
 
-SPLINE_SAMPLES = 3
+SPLINE_SAMPLES, SLIT_PIXELS = 3, 4  # on which a part of a pixel is spread
 TWO, THREE = np.uintp(2), np.uintp(3)
 LEAST_SPREAD = 1e-3  # px, of a view whose lines are upright
 
 
-def split_between_rows(row: NDArray[np.float64]) -> tuple[NDArray[np.int32], Image]:
-    """Put positions, (points,), between rows: the first of three, and samples of the quadratic
-    B-spline there, (points, 3).
+@compile_loop(fastmath=SUMS_IN_ANY_ORDER)
+def split_between_rows(row, share, margin, first, shares, reached):
+    """Put the `share` (places,) of light at each position, (places,), between rows: the first of three,
+    and samples of the quadratic B-spline there, (places, 3). What misses all rows, and a margin before and
+    behind them, is dark, and lies where others do. `reached`: those rows, which light is put into.
     """
-    middle = np.floor(row + 0.5)
-    off = row - middle
-    shares = np.empty((row.size, SPLINE_SAMPLES), np.float32)
-    shares[:, 0] = 0.5 * (0.5 - off) ** 2
-    shares[:, 1] = 0.75 - off * off
-    shares[:, 2] = 0.5 * (0.5 + off) ** 2
-    return middle.astype(np.int32) - np.int32(1), shares
+    last = reached.size - margin - SPLINE_SAMPLES
+    lowest, highest = last, -margin
+    for place in range(row.size):
+        where = min(max(row[place], -margin - SPLINE_SAMPLES), last + SPLINE_SAMPLES)
+        middle = math.floor(where + 0.5)
+        off, top, light = where - middle, int(middle) - 1, share[place]
+        first[place] = top
+        if -margin < top < last:
+            lowest, highest = min(lowest, top), max(highest, top)
+        else:
+            light = np.float32(0)
+        shares[place, 0] = light * (0.5 * (0.5 - off) ** 2)
+        shares[place, 1] = light * (0.75 - off * off)
+        shares[place, 2] = light * (0.5 * (0.5 + off) ** 2)
+    for place in range(row.size):
+        first[place] = min(max(first[place], lowest), highest)
+        for sample in range(SPLINE_SAMPLES):
+            reached[first[place] + margin + sample] = True
 
 
 @fast_loop
-def split_over_slit(position, width, height, tangent, first, shares):
-    """Share of parts of picture pixels that falls on each slit pixel, (parts, reach), from `first` on.
-    A part is a rectangle, px: its height spreads it by the tangent of the line's angle, so that its
-    light on the slit is a trapezium, whose integral is made of four parabolas.
+def split_over_slit(position, width, height, tangent, columns, first, shares):
+    """Share of parts of picture pixels that falls on each slit pixel, (parts, 4), from `first` on; nothing of
+    parts that are farther from its `columns` than they reach. A part is a rectangle, px: its height spreads it
+    by the tangent of the line's angle, so that its light on the slit is a trapezium, whose integral is made of
+    four parabolas.
     """
-    reach = shares.shape[1]
     for part in range(position.size):
         across, spread = width[part], max(math.fabs(tangent) * height[part], LEAST_SPREAD)
         wide, narrow = 0.5 * (across + spread), 0.5 * math.fabs(across - spread)
-        start = math.floor(position[part] - wide + 0.5)
+        place = min(max(position[part], -SLIT_PIXELS), columns + SLIT_PIXELS)
+        start = math.floor(place - wide + 0.5)
         first[part] = start
+        light = 0.5 / (across * spread) if place == position[part] else 0.0
         before = 0.0
-        for slit in range(reach):
-            edge = start + slit + 0.5 - position[part]
+        for slit in range(SLIT_PIXELS):
+            edge = start + slit + 0.5 - place
             upto = max(edge + wide, 0.0) ** 2 - max(edge + narrow, 0.0) ** 2
             upto += max(edge - wide, 0.0) ** 2 - max(edge - narrow, 0.0) ** 2
-            upto /= 2 * across * spread
+            upto *= light
             shares[part, slit] = upto - before
             before = upto
 

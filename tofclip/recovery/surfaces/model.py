@@ -25,7 +25,7 @@ from tofclip.camera import Camera, estimate_dark_level
 from tofclip.camera.model import MergedSweep
 from tofclip.recovery.defects import estimate_noise
 from tofclip.recovery.surfaces.patches import MIN_BEHIND_FRACTION
-from tofclip.recovery.surfaces.points import SLIT_PIXELS, SurfacePoints, SurfaceState
+from tofclip.recovery.surfaces.points import SurfacePoints, SurfaceState
 from tofclip.recovery.surfaces.pulse import (
     EXTENT_SIGMAS,
     SPLINE_LEFT_VARIANCE,
@@ -268,7 +268,7 @@ class SurfaceModel(SurfacePoints):
 
     def _find_box(self, view: int, part: slice) -> Box:
         """Rows and columns of a view's picture that the light of some points reaches."""
-        from tofclip.recovery.surfaces.kernels import SPLINE_SAMPLES
+        from tofclip.recovery.surfaces.kernels import SLIT_PIXELS, SPLINE_SAMPLES
 
         place = self.footprints[view]
         begin, end, _ = part.indices(self.surface.size)
@@ -430,7 +430,8 @@ class SurfaceModel(SurfacePoints):
 
     def _find_shades(self) -> None:
         """How bright each view sees each point, (views, points), beside its amplitude, and as its gain has it."""
-        shading = np.exp(np.where(self.behind, self.state.shading.T[:, self.surface], 0))
+        shading = np.ones((self.camera.views, self.surface.size))
+        shading[:, self.behind] = np.exp(self.state.shading[self.surface[self.behind]].T)
         shading[:, self.outer] *= np.maximum(1 + self.state.borders * self.excess, 0)
         self._shades = shading.astype(np.float32)
         shading *= self.state.gains[:, np.newaxis]

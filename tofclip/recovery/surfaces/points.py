@@ -45,7 +45,6 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 Shape = tuple[SmoothBasis, FloatArray]  # of a surface's inverse depth, with its coefficients
 
-SLIT_PIXELS = 4
 # Rows that a part of a pixel spans where a surface is turned far, those from which on a side has two parts, and parts
 # along a side at most. A pulse of a row or more hardly tells so narrow a ramp from an instant; but a pixel of a ball is
 # not where its middle is: with one part in the middle of the ball it was 0.1 mm too near there, and too far about it.
@@ -128,9 +127,12 @@ class Places(NamedTuple):
         point = np.repeat(np.arange(distance.size), total)
         starts = np.concatenate([[0], np.cumsum(total)])
         right, down = np.divmod(np.arange(point.size) - starts[point], counts[1, point])
-        size = (filled / counts)[:, point]
-        offset = (np.stack([right, down]) + 0.5) * size - 0.5 * filled[:, point] + aside[:, point]
-        away = np.sum(offset * (slopes / filled)[:, point], axis=0)
+        size, begin, steep = (
+            np.take(one, point, axis=1)
+            for one in (filled / counts, aside - 0.5 * filled, slopes / filled)
+        )
+        offset = (np.stack([right, down]) + 0.5) * size + begin
+        away = np.sum(offset * steep, axis=0)
         ramp = np.hypot(*slopes) / row_m / pulse_rows  # pulses that a pixel spans
         overlap = (1 / np.sqrt(1 + ramp**2 / 12)).astype(np.float32)
         share, narrower = (1 / total[point]).astype(np.float32), filled**2 * (1 - 1 / counts**2)
@@ -138,14 +140,14 @@ class Places(NamedTuple):
 
     def choose(self, distance: FloatArray, light: FloatArray) -> Places:
         """Return those that have light, (places,), at such distances."""
-        kept = light > 0
+        kept = np.flatnonzero(light > 0)
         point = self.point[kept]
         share = light[kept] / np.bincount(point, light[kept])[point]
         return self._replace(
             point=point,
             starts=np.concatenate([[0], np.cumsum(np.bincount(point))]),
-            offset=self.offset[:, kept],
-            size=self.size[:, kept],
+            offset=np.take(self.offset, kept, axis=1),
+            size=np.take(self.size, kept, axis=1),
             distance=distance[kept],
             share=share.astype(np.float32),
         )
@@ -275,7 +277,8 @@ class SurfacePoints:
         # of each surface, (points, coefficients), of the inverse depths
         self.derivatives = [basis.differentiate(f, c) for basis, f, c in shapes]
         self.distance = np.asarray(self.ray_length / np.maximum(inverse, MIN_INVERSE_DEPTH))
-        slopes, bent = self.compute_slopes(), np.isin(self.surface, list(self._list_quadrics()))
+        bent = np.isin(np.arange(len(self.bases)), list(self._list_quadrics()))[self.surface]
+        slopes = self.compute_slopes()
         self.places = Places.split(
             self.distance, slopes, self.aside, bent, self.pulse.sigma, self.row_m
         )
@@ -285,6 +288,11 @@ class SurfacePoints:
         depth = self.distance[self.outer] / self.ray_length[self.outer]
         left = np.where(self.column[self.outer] == 0, 1, -1) * self.camera.shear_at(depth)
         self.excess = np.clip(np.outer(self.camera.view_positions, left), -1, 1)
+        # places there, the number of each one's point among these, and the side on which it lies
+        there = self.column[self.places.point]
+        outer = np.flatnonzero((there == 0) | (there == self.masks.shape[2] - 1))
+        number = np.searchsorted(self.outer, self.places.point[outer])
+        self._outer_parts = outer, number, np.where(there[outer] == 0, -1, 1)
         self.half = int(np.ceil(EXTENT_SIGMAS * MAX_LENGTHENING * self.pulse.sigma)) + 1
         self.margin = self.half + 3
         # rows before and behind the streak image whose light reaches it later or earlier
@@ -330,7 +338,9 @@ class SurfacePoints:
         parts, found = np.diff(places.starts), (within, light, area, area * distance)
         inside, lights, areas, total = (np.bincount(places.point, one) for one in found)
         self.facing, self.at_limb = lights / parts, inside < parts
-        self.distance = np.where(np.isin(self.surface, list(curved)), total / areas, self.distance)
+        for surface in curved:
+            part = self.parts[surface]
+            self.distance[part] = total[part] / areas[part]
 
     def fill_partly(self, amplitude: Image) -> None:
         """Put the light of pixels that a surface fills in part on the side of the brighter of the pixels
@@ -404,33 +414,21 @@ class SurfacePoints:
         """
         from tofclip.recovery.surfaces import kernels
 
-        rows, margin, samples = self._rows, self.margin, kernels.SPLINE_SAMPLES
+        rows, margin, slits = self._rows, self.margin, kernels.SLIT_PIXELS
         row, column, slit, pace = self._locate(view, x, y, right, shear)
         first_parts = self.places.starts[:-1]
         place = slit[first_parts], self.measure_height(row[first_parts])
         row += self.before
-        columns = self.shape[1]
-        away, last = margin + samples, rows + margin - samples
-        first, shares = kernels.split_between_rows(np.clip(row, -away, rows + away))
-        dark = (first <= -margin) | (first >= last)
-        shares *= self.places.share[:, np.newaxis]
-        shares[dark] = 0
-        seen = first[~dark]  # the others are among these
-        np.clip(first, seen.min(initial=last), seen.max(initial=-margin), out=first)
-        slit_first = np.empty(row.size, np.int32)
-        slit_shares = np.empty((row.size, SLIT_PIXELS), np.float32)
-        outward, further = self._reach_out(view)
-        column += outward
-        along = np.clip(column, -SLIT_PIXELS, columns + SLIT_PIXELS)
+        reached, columns = np.zeros(rows + 2 * margin, bool), self.shape[1]
+        first, slit_first = np.empty((2, row.size), np.int32)
+        shares = np.empty((row.size, kernels.SPLINE_SAMPLES), np.float32)
+        kernels.split_between_rows(row, self.places.share, margin, first, shares, reached)
+        slit_shares = np.empty((row.size, slits), np.float32)
         tangent = float(np.tan(self.camera.angles[view]))
-        across, down = self.places.size
-        across = across * (1 + further)
-        kernels.split_over_slit(along, across, down, tangent, slit_first, slit_shares)
-        slit_shares[along != column] = 0
+        across, down = self._reach_out(view, column), self.places.size[1]
+        kernels.split_over_slit(column, across, down, tangent, columns, slit_first, slit_shares)
         left = int(slit_first.min(initial=columns))
-        wide = max(int(slit_first.max(initial=-SLIT_PIXELS)) + SLIT_PIXELS - left, 0)
-        hit = np.bincount(first + margin, minlength=rows + 2 * margin)
-        reached = np.convolve(hit, np.ones(samples))[: hit.size] > 0
+        wide = max(int(slit_first.max(initial=-slits)) + slits - left, 0)
         lit = np.convolve(reached, np.ones(2 * self.half + 1), "same")[margin:-margin] > 0
         lines = np.flatnonzero(lit)
         top = int(lines.min(initial=rows)) - margin
@@ -441,15 +439,16 @@ class SurfacePoints:
         reached_rows = np.flatnonzero(reached) - margin - top
         return Footprint(*light, lines - top, reached_rows, *place, pace)
 
-    def _reach_out(self, view: int) -> tuple[FloatArray, FloatArray]:
-        """Where a view's picture ends beyond the outer columns: by how much parts of points lie further to
-        the right, px, and are wider, relative, (places,) each.
+    def _reach_out(self, view: int, column: FloatArray) -> FloatArray:
+        """Return how wide parts of points are, (places,), px, where a view's picture ends beyond the outer
+        columns; their places on the slit, `column`, are moved.
         """
-        further, side = np.zeros((2, self.surface.size))
-        further[self.outer] = self.state.borders * self.excess[view]
-        side[self.outer] = np.where(self.column[self.outer] == 0, -1, 1)
-        further, side = further[self.places.point], side[self.places.point]
-        return side * further * (0.5 + side * self.places.offset[0]), further
+        across = self.places.size[0].copy()
+        outer, further, side = self._outer_parts
+        further = self.state.borders * self.excess[view, further]
+        column[outer] += side * further * (0.5 + side * self.places.offset[0, outer])
+        across[outer] *= 1 + further
+        return across
 
     def _locate(
         self, view: int, x: FloatArray, y: FloatArray, right: FloatArray, shear: FloatArray
@@ -471,10 +470,11 @@ class SurfacePoints:
         row, pace = interpolate_linearly(time, self.times, np.arange(float(self.times.size))), 1.0
         if camera.sweep is not None:
             few = slice(None, None, PACE_PLACES)
-            later, _ = camera.sweep.raw_position(row[few] + 0.5, column[few])
-            row, raw_column = camera.sweep.raw_position(row, column)
+            moved = np.append(row, row[few] + 0.5), np.append(column, column[few])
+            raw_row, raw_column = camera.sweep.raw_position(*moved)
+            row, later = np.split(raw_row, [row.size])
             pace = 2 * float(np.mean(later - row[few])) if row.size else 1.0
-            column = np.array(raw_column, np.float64)
+            column = np.array(raw_column[: row.size], np.float64)
         delay, stretch = (
             interpolate_linearly(slit, camera.centres_px, one)
             for one in (self.state.delays, self.state.stretches)
