@@ -151,7 +151,7 @@ def _fit_returns(
     tick: Tick,
 ) -> SurfaceFit:
     """Fit the surfaces that returns show. `darkness`: of `estimate_darkness`."""
-    solver = find_surfaces(found, streak, frames, weight, darkness)
+    solver, seen = find_surfaces(found, streak, frames, weight, darkness)
 
     # 4. Amplitudes, and the pulse as they show it.
     solver.run(PULSE_ITERATIONS, tick, AGAINST_DIM)
@@ -193,7 +193,7 @@ def _fit_returns(
     solver.run(iterations, tick)
     reference = solver.model.unexplained(solver.amplitude)
     beside = find_others(solver, found, tick)
-    return SurfaceFit(solver, sparse, refinement, remainder, reference, *beside, found)
+    return SurfaceFit(solver, sparse, refinement, remainder, reference, *beside, seen)
 
 
 def _fit_ranges(

@@ -69,9 +69,9 @@ SLOPE_WINDOW_PX = 7
 
 def find_surfaces(
     found: Returns, streak: Streak, frames: Frames, weight: float, darkness: float
-) -> AmplitudeSolver:
-    """Find the surfaces that the returns of frames show; refuse what is no shot of surfaces. `darkness`:
-    of `estimate_darkness`.
+) -> tuple[AmplitudeSolver, Returns]:
+    """Find the surfaces that the returns of frames show, and what else frames show of them; refuse what is no
+    shot of surfaces. `darkness`: of `estimate_darkness`.
     """
     camera, bin_m = frames.camera, SPEED_OF_LIGHT * frames.bin_width / 2
     ray_length = measure_rays(camera)
@@ -96,7 +96,10 @@ def find_surfaces(
     state = SurfaceState.start([patch.coefficients for patch in patches], camera)
     bases = [patch.basis for patch in patches]
     model = SurfaceModel(streak, camera, masks, bases, state)
-    return AmplitudeSolver(model, amplitude, weight)
+    alone = np.ones(ray_length.shape, bool)
+    alone[found.y, found.x] = False
+    seen = found.merge(shown[alone[shown.y, shown.x]])
+    return AmplitudeSolver(model, amplitude, weight), seen
 
 
 def _add_pooled(
