@@ -241,14 +241,15 @@ class NormalEquations:
             for down, right in np.argwhere(lit) * sides:
                 part = group.images[:, down : down + CLUSTER_ROWS, right : right + CLUSTER_COLUMNS]
                 place = group.row + int(down), group.column + int(right)
-                parts.setdefault(place, []).append((own, part.reshape(own.size, -1)))
+                parts.setdefault(place, []).append((own, part))
         normal, slope = np.zeros((len(names), len(names))), np.zeros(len(names))
         clusters, root = [], np.sqrt(weights)
         rest, error = root * rest, root * error
         for (row, column), found in parts.items():
             area = slice(row, row + CLUSTER_ROWS), slice(column, column + CLUSTER_COLUMNS)
             numbers, images = (np.concatenate(one) for one in zip(*found, strict=True))
-            images *= root[area].ravel()
+            images *= root[area]
+            images = images.reshape(numbers.size, -1)
             information = images @ images.T
             normal[numbers[:, np.newaxis], numbers] += information
             slope[numbers] += images @ rest[area].ravel()

@@ -108,12 +108,12 @@ def _add_pooled(
     """Add what pixels without a return show together with those about them: of a surface in little light
     none alone is out of the noise, but many beside each other are at one range.
     """
-    pooled = scipy.ndimage.gaussian_filter(frames.values, (0, sigma_px, sigma_px))
-    pooled[:, shown.y, shown.x] = frames.values[:, shown.y, shown.x]
-    found = depth(replace(frames, values=pooled), shown.camera)
-    found = _leave_out_doubtful(found, ray_length, bin_m)
     alone = np.zeros(ray_length.shape, bool)
     alone[shown.y, shown.x] = True
+    pooled = scipy.ndimage.gaussian_filter(frames.values, (0, sigma_px, sigma_px))
+    pooled = np.where(alone, frames.values, pooled)
+    found = depth(replace(frames, values=pooled), shown.camera)
+    found = _leave_out_doubtful(found, ray_length, bin_m)
     return shown.merge(found[~alone[found.y, found.x]])
 
 
