@@ -276,17 +276,19 @@ def explain_by_amplitude(
     """Return the change of amplitude x that lowers ``|image - A x|_w`` most, by conjugate gradients
     in the scale of `scale_amplitude`, and what is left of the image.
     """
-    change, direction, before, rest = np.zeros_like(scale), np.zeros_like(scale), 1.0, image.copy()
+    change, direction, before = np.zeros_like(scale), np.zeros_like(scale), 1.0
+    left = image.copy()
+    rest, weights = left[model.lit], model.weights[model.lit]
     for _ in range(iterations):
-        pull = scale * model.gather(model.weights * rest)
+        pull = scale * model.gather_lit(weights * rest)
         energy = float(np.sum(pull**2, dtype=np.float64))
         if energy == 0:
             break
         direction = pull + np.float32(energy / before) * direction
-        light = model.render(scale * direction)
-        length = np.float32(energy / max(float(np.vdot(model.weights * light, light)), TINY))
+        light = model.render_lit(scale * direction)
+        length = np.float32(energy / max(float(np.vdot(weights * light, light)), TINY))
         change += length * scale * direction
         light *= length
         rest -= light
         before = energy
-    return change, rest
+    return change, left

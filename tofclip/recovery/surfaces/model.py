@@ -151,7 +151,7 @@ class SurfaceModel(SurfacePoints):
         self._lit_before = slice(int(rows.min(initial=last)), last)
         first = self._lit_before.start - self.before + int(self.pulse.lags.min())
         last = min(last - self.before + int(self.pulse.lags.max()), self.shape[0])
-        self._lit = slice(min(max(first, 0), max(last, 0)), max(last, 0))
+        self.lit = slice(min(max(first, 0), max(last, 0)), max(last, 0))
         self._find_shades()
 
     def make_kernel(
@@ -323,7 +323,7 @@ class SurfaceModel(SurfacePoints):
     def render(self, amplitude: Image) -> Image:
         """Return A a, (rows, columns)."""
         image = np.zeros_like(self.image)
-        image[self._lit] = self._render_lit(amplitude)
+        image[self.lit] = self.render_lit(amplitude)
         return image
 
     def render_instants(self, amplitude: Image) -> Image:
@@ -335,7 +335,7 @@ class SurfaceModel(SurfacePoints):
             image[window.area] += window.images[0]
         return image
 
-    def _render_lit(self, amplitude: Image) -> Image:
+    def render_lit(self, amplitude: Image) -> Image:
         """The rows of A a that light reaches."""
         rows = self._lit_before
 
@@ -348,29 +348,29 @@ class SurfaceModel(SurfacePoints):
             return seen
 
         light = reduce(np.add, self.share_out(work, self.camera.views))
-        first = self._lit.start + self.before - rows.start
-        return self._trail(light, first, self._lit.stop - self._lit.start)[0]
+        first = self.lit.start + self.before - rows.start
+        return self._trail(light, first, self.lit.stop - self.lit.start)[0]
 
     def pull(self, amplitude: Image, image: Image | None = None) -> Image:
         """Return A'W(A a - image), (points,), how the misfit changes with amplitudes; without an image
         A'WA a.
         """
-        rest = self._render_lit(amplitude)
+        rest = self.render_lit(amplitude)
         if image is not None:
-            rest -= image[self._lit]
-        rest *= self.weights[self._lit]
-        return self._gather_lit(rest)
+            rest -= image[self.lit]
+        rest *= self.weights[self.lit]
+        return self.gather_lit(rest)
 
     def gather(self, image: Image, squared: bool = False) -> Image:
         """Return A' of an image, (points,); squared: with the squares of all entries."""
-        return self._gather_lit(image[self._lit], squared)
+        return self.gather_lit(image[self.lit], squared)
 
     def gather_views(self, image: Image) -> list[Image]:
         """Return what each view adds to A' of an image, (points,) each."""
-        lit = self._spread_back(image[self._lit])
+        lit = self._spread_back(image[self.lit])
         return [self._gather(lit, (view,)) for view in range(self.camera.views)]
 
-    def _gather_lit(self, image: Image, squared: bool = False) -> Image:
+    def gather_lit(self, image: Image, squared: bool = False) -> Image:
         """A' of the rows of an image that light reaches."""
         seen = self._blur(image[np.newaxis])[0] if squared else self._spread_back(image)
         shares = self.share_out(partial(self._gather, seen, squared=squared), self.camera.views)
@@ -385,7 +385,7 @@ class SurfaceModel(SurfacePoints):
             return image
         rows = self._lit_before
         seen = np.zeros((1, rows.stop - rows.start, image.shape[1]), np.float32)
-        lines = np.arange(seen.shape[1]), rows.start - self._lit.start - self.before
+        lines = np.arange(seen.shape[1]), rows.start - self.lit.start - self.before
         shares = self.pulse.shares.astype(np.float32)
         smooth_rows(image[np.newaxis], shares, -self.pulse.lags, *lines, 0, seen)
         return seen[0]
@@ -399,7 +399,7 @@ class SurfaceModel(SurfacePoints):
         found = np.zeros((1, self.surface.size), np.float32)
         above, lags = self._lit_before.start, self._lags
         if squared or not self.pulse.reach:
-            above = self._lit.start + self.before
+            above = self.lit.start + self.before
         for view in views:
             place, kernel, shares = self.footprints[view], self.kernels[view], self._shares[view]
             if not place.lit_rows.size:
