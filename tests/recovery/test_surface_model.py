@@ -9,6 +9,7 @@ import pytest
 from surface_scene import BIN, CAMERA, INSTRUMENT, SCENE, SHAPE, make_model
 
 from tofclip.lidar import compute_ray_directions
+from tofclip.recovery.surfaces import points
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.model import SurfaceModel, weigh_measurements
 from tofclip.recovery.surfaces.points import SurfaceState
@@ -42,6 +43,19 @@ def test_the_adjoint_matches(shot, blur_px: float):
     y = random.standard_normal(model.image.shape).astype(np.float32)
     there = np.vdot(model.render(x).astype(np.float64), y)
     assert there == pytest.approx(float(np.vdot(x.astype(np.float64), model.gather(y))), rel=1e-4)
+
+
+def test_threads_share_out_the_same_light(shot, monkeypatch):
+    """As of large shots, which no test has."""
+    model = make_model(shot.streak)
+    light = np.random.default_rng(0).random(model.surface.size).astype(np.float32)
+    seen, found = model.render(light), model.gather(model.image)
+    monkeypatch.setattr(points, "PARALLEL_POINTS", 0)
+    monkeypatch.setenv("TOFCLIP_THREADS", "3")
+    model.place(model.state)
+    assert model.is_large
+    for one, other in ((model.render(light), seen), (model.gather(model.image), found)):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5 * float(np.abs(other).max()))
 
 
 @pytest.mark.parametrize("tail", [False, True])
