@@ -278,7 +278,7 @@ def explain_by_amplitude(
     """
     change, direction, before = np.zeros_like(scale), np.zeros_like(scale), 1.0
     left = image.copy()
-    rest, weights = left[model.lit], model.weights[model.lit]
+    rest, weights = left[model.lit], model.weights[model.lit]  # `rest` is a part of what is left
     for _ in range(iterations):
         pull = scale * model.gather_lit(weights * rest)
         energy = float(np.sum(pull**2, dtype=np.float64))

@@ -111,7 +111,7 @@ class SurfaceFit:
     # of the frames, where the shot shows light that no surface explains; ranges as measured
     others: Returns
     whole: AmplitudeSolver  # with what is expected of their light
-    seen: Returns  # of the frames, all
+    seen: Returns  # of the frames, all; in little light also of means over more pixels
 
 
 @limit_blas_threads()  # products of a few dozen columns are too small to share

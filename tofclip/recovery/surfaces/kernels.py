@@ -26,6 +26,7 @@ TWO, THREE = np.uintp(2), np.uintp(3)
 LEAST_SPREAD = 1e-3  # px, of a view whose lines are upright
 
 
+# what a step that is too long leads to may be at no row at all, and is dark
 @compile_loop(fastmath=SUMS_IN_ANY_ORDER)
 def split_between_rows(row, share, margin, first, shares, reached):
     """Put the `share` (places,) of light at each position, (places,), between rows: the first of three,

@@ -96,9 +96,8 @@ def find_surfaces(
     state = SurfaceState.start([patch.coefficients for patch in patches], camera)
     bases = [patch.basis for patch in patches]
     model = SurfaceModel(streak, camera, masks, bases, state)
-    alone = np.ones(ray_length.shape, bool)
-    alone[found.y, found.x] = False
-    seen = found.merge(shown[alone[shown.y, shown.x]])
+    there = np.isfinite(found.image("range"))
+    seen = found.merge(shown[~there[shown.y, shown.x]])
     return AmplitudeSolver(model, amplitude, weight), seen
 
 
@@ -108,13 +107,12 @@ def _add_pooled(
     """Add what pixels without a return show together with those about them: of a surface in little light
     none alone is out of the noise, but many beside each other are at one range.
     """
-    alone = np.zeros(ray_length.shape, bool)
-    alone[shown.y, shown.x] = True
+    there = np.isfinite(shown.image("range"))
     pooled = scipy.ndimage.gaussian_filter(frames.values, (0, sigma_px, sigma_px))
-    pooled = np.where(alone, frames.values, pooled)
+    pooled = np.where(there, frames.values, pooled)
     found = depth(replace(frames, values=pooled), shown.camera)
     found = _leave_out_doubtful(found, ray_length, bin_m)
-    return shown.merge(found[~alone[found.y, found.x]])
+    return shown.merge(found[~there[found.y, found.x]])
 
 
 def measure_rays(camera: Camera) -> FloatArray:
